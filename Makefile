@@ -1,0 +1,46 @@
+# Every target makes the environment it needs; `make eval` and `make test` work on a fresh machine.
+SHELL := /bin/bash
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+export MUJOCO_GL ?= egl
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# WANDB_MODE=online sends runs to your account; nothing is sent unless you say so.
+export WANDB_MODE ?= offline
+# Model weights come from this repository or from a path you give, never from a hub.
+export HF_HUB_OFFLINE ?= 1
+
+.PHONY: setup eval test check motions lock clean
+
+setup: $(STAMP)
+
+$(STAMP): requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python >= 3.11 is needed, this is " + sys.version.split()[0])'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
+eval: $(STAMP)
+	$(BIN)/python eval.py planner=proprio robot=h1
+
+test: $(STAMP)
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+check: $(STAMP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+# Real human motion (two OMOMO clips, five climbing clips), data only: 100 MB, used by tests marked `motions`.
+motions: $(STAMP)
+	$(BIN)/python -m pip install --quiet --no-deps holosoma-retargeting==0.1.0
+
+# Re-pins the environment from pyproject.toml. torch stays at the version that has a CPU build.
+lock: $(STAMP)
+	$(BIN)/python tools/lock.py > requirements.lock.tmp && mv requirements.lock.tmp requirements.lock
+
+clean:
+	rm -rf $(VENV) outputs

@@ -1,0 +1,1 @@
+"""Hydra YAML groups and the frozen dataclasses that validate them; the lowest layer."""

@@ -1,0 +1,98 @@
+"""Composes the YAML groups with command-line overrides into one plain mapping, through Hydra.
+
+The entry points call `compose` and hand the result to `configs.validate.build`; nothing else in the project knows Hydra. A wrong
+group value or key stops here with the allowed ones; a wrong value of a plain key stops in `build`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from configs.validate import ConfigError
+
+__all__ = ["CONFIG_DIR", "compose", "groups"]
+
+CONFIG_DIR = Path(__file__).resolve().parent
+
+
+def groups() -> dict[str, tuple[str, ...]]:
+    """The config groups (folders of `configs/`) with the values each allows, sorted."""
+    found: dict[str, tuple[str, ...]] = {}
+    for folder in sorted(path for path in CONFIG_DIR.iterdir() if path.is_dir()):
+        names = tuple(sorted(path.stem for path in folder.glob("*.yaml")))
+        if names:
+            found[folder.name] = names
+    return found
+
+
+def compose(root: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """Composes `configs/<root>.yaml` with overrides such as `robot=x1` or `trials=3`.
+
+    Args:
+        root: name of a root file, `train` or `eval`.
+        overrides: Hydra override strings.
+
+    Returns:
+        A plain nested dictionary, every interpolation resolved.
+
+    Raises:
+        ConfigError: on a malformed override, an unknown group, group value or key; the message lists what is allowed.
+    """
+    if not (CONFIG_DIR / f"{root}.yaml").is_file():
+        allowed = ", ".join(sorted(path.stem for path in CONFIG_DIR.glob("*.yaml")))
+        raise ConfigError(f"no root config {root!r}; allowed: {allowed}")
+    _check_groups(overrides)
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(config_dir=str(CONFIG_DIR), version_base=None):
+            config = hydra_compose(config_name=root, overrides=list(overrides))
+            values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(_explain(error, root, overrides)) from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"configs/{root}.yaml: expected a mapping, got {type(values).__name__}")
+    return {str(key): value for key, value in values.items()}
+
+
+def _check_groups(overrides: Sequence[str]) -> None:
+    known = groups()
+    for override in overrides:
+        key, sep, value = override.partition("=")
+        if not sep and not key.startswith("~"):
+            raise ConfigError(f"override {override!r}: expected key=value")
+        name = key.lstrip("+")
+        if name in known and value not in known[name] and value != "null":
+            raise ConfigError(f"{name}={value!r} is not allowed; allowed: {', '.join(known[name])}")
+
+
+def _explain(error: Exception, root: str, overrides: Sequence[str]) -> str:
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(config_dir=str(CONFIG_DIR), version_base=None):
+        try:
+            config = hydra_compose(config_name=root)
+        except (HydraException, OmegaConfBaseException):
+            return f"configs/{root}.yaml does not compose: {_first_line(error)}"
+    for override in overrides:
+        key = override.partition("=")[0].lstrip("+~")
+        node: Any = config
+        path: list[str] = []
+        for part in key.split("."):
+            if not isinstance(node, DictConfig) or part not in node:
+                allowed = ", ".join(sorted(str(k) for k in node)) if isinstance(node, DictConfig) else "none"
+                return f"{'.'.join([*path, part])}: unknown key in {override!r}; allowed: {allowed}"
+            path.append(part)
+            node = node[part] if not OmegaConf.is_missing(node, part) else None
+    return _first_line(error)
+
+
+def _first_line(error: Exception) -> str:
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)

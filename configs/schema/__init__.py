@@ -1,0 +1,1 @@
+"""Frozen dataclasses behind the YAML groups, one module per concern."""

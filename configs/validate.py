@@ -1,0 +1,116 @@
+"""Turns plain mappings (from YAML or the command line) into frozen dataclasses, refusing what they do not declare.
+
+Library code never sees a DictConfig: `build` is the only door. A wrong key, type or value stops at once with the path of the
+offending entry and the allowed ones.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+from collections.abc import Mapping
+from enum import Enum
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+__all__ = ["ConfigError", "build"]
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A configuration entry that is not allowed; the message names its path, its value and what is allowed."""
+
+
+def build(cls: type[T], values: Mapping[str, Any], where: str = "") -> T:
+    """Builds the frozen dataclass `cls` from a mapping.
+
+    Args:
+        cls: a dataclass; nested dataclasses, enums, Literal, tuples, Optional and plain scalars are understood.
+        values: plain mapping with string keys.
+        where: dotted path of this mapping in the whole configuration, for messages.
+
+    Raises:
+        ConfigError: on an unknown key, a missing required key, or a value of the wrong type or outside the allowed set.
+    """
+    if not dataclasses.is_dataclass(cls):
+        raise TypeError(f"{cls!r} is not a dataclass")
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{where or cls.__name__}: expected a mapping, got {values!r}")
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
+    unknown = [key for key in values if key not in fields]
+    if unknown:
+        raise ConfigError(f"{_at(where, str(unknown[0]))}: unknown key; allowed: {', '.join(sorted(fields))}")
+    hints = get_type_hints(cls)
+    kwargs: dict[str, Any] = {}
+    for name, f in fields.items():
+        if name in values:
+            kwargs[name] = _convert(hints[name], values[name], _at(where, name))
+        elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
+            raise ConfigError(f"{_at(where, name)}: missing")
+    try:
+        return cls(**kwargs)
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"{where or cls.__name__}: {error}") from error
+
+
+def _at(where: str, name: str) -> str:
+    return f"{where}.{name}" if where else name
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    origin = get_origin(hint)
+    if hint is Any:
+        return value
+    if origin is Literal:
+        allowed = get_args(hint)
+        # YAML 1.1 reads on/off/yes/no as booleans.
+        if value not in allowed or isinstance(value, bool) != isinstance(allowed[0], bool):
+            raise ConfigError(f"{where}: {value!r} is not allowed; allowed: {', '.join(map(str, allowed))}")
+        return value
+    if origin in (Union, types.UnionType):
+        options = get_args(hint)
+        if value is None and type(None) in options:
+            return None
+        errors: list[str] = []
+        for option in options:
+            if option is type(None):
+                continue
+            try:
+                return _convert(option, value, where)
+            except ConfigError as error:
+                errors.append(str(error))
+        raise ConfigError("; ".join(errors))
+    if origin is tuple:
+        if isinstance(value, str) or not hasattr(value, "__iter__"):
+            raise ConfigError(f"{where}: expected a list, got {value!r}")
+        items, args = list(value), get_args(hint)
+        if len(args) == 2 and args[1] is Ellipsis:
+            return tuple(_convert(args[0], item, f"{where}[{i}]") for i, item in enumerate(items))
+        if len(items) != len(args):
+            raise ConfigError(f"{where}: expected {len(args)} entries, got {value!r}")
+        return tuple(_convert(arg, item, f"{where}[{i}]") for i, (arg, item) in enumerate(zip(args, items, strict=True)))
+    if origin in (dict, Mapping) or getattr(origin, "__name__", "") == "Mapping":
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"{where}: expected a mapping, got {value!r}")
+        key_hint, value_hint = get_args(hint)
+        return {_convert(key_hint, k, where): _convert(value_hint, v, f"{where}.{k}") for k, v in value.items()}
+    if isinstance(hint, type):
+        if dataclasses.is_dataclass(hint):
+            return value if isinstance(value, hint) else build(hint, value, where)
+        if issubclass(hint, Enum):
+            try:
+                return hint(value)
+            except ValueError:
+                allowed_values = ", ".join(str(member.value) for member in hint)
+                raise ConfigError(f"{where}: {value!r} is not allowed; allowed: {allowed_values}") from None
+        if hint is Path and isinstance(value, (str, Path)):
+            return Path(value)
+        if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+            return float(value)
+        if isinstance(value, hint) and not (hint is not bool and isinstance(value, bool)):
+            return value
+        raise ConfigError(f"{where}: expected {hint.__name__}, got {value!r}")
+    raise TypeError(f"{where}: unsupported type {hint!r} in a config dataclass")

@@ -1,0 +1,1 @@
+"""Motion data and plain records: generation, HumanML3D, retargeting, filtering, alignment shards."""

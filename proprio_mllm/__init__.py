@@ -1,0 +1,1 @@
+"""Proprio-MLLM: a proprioception-aware multimodal planner, its training and its evaluation."""
