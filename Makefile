@@ -11,7 +11,7 @@ export WANDB_MODE ?= offline
 # Model weights come from this repository or from a path you give, never from a hub.
 export HF_HUB_OFFLINE ?= 1
 
-.PHONY: setup eval test check motions lock clean
+.PHONY: setup eval test check motions lock third-party clean
 
 setup: $(STAMP)
 
@@ -44,3 +44,6 @@ lock: $(STAMP)
 
 clean:
 	rm -rf $(VENV) outputs
+
+third-party: $(STAMP)
+	$(BIN)/python tools/third_party.py > THIRD_PARTY.md

@@ -1,7 +1,7 @@
 """Composes the YAML groups with command-line overrides into one plain mapping, through Hydra.
 
-The entry points call `compose` and hand the result to `configs.validate.build`; nothing else in the project knows Hydra. A wrong
-group value or key stops here with the allowed ones; a wrong value of a plain key stops in `build`.
+The entry points call `compose` and hand the result to `configs.validate.build`; nothing else in the project knows Hydra. A
+wrong group value or key stops here with the allowed ones; a wrong value of a plain key stops in `build`.
 """
 
 from __future__ import annotations

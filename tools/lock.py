@@ -1,6 +1,6 @@
 """Prints the pins of the current environment for `requirements.lock`: `make lock`.
 
-Local version suffixes (`+cpu`) are dropped, so that the same lock serves machines that find a CPU build and machines that do not.
+Local version suffixes (`+cpu`) are dropped, so that one lock serves machines that find a CPU build and machines that do not.
 """
 
 from __future__ import annotations
