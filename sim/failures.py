@@ -1,0 +1,165 @@
+"""Why an action failed: one code per reason, the paper's failure type it rolls up to, and the margins that explain it.
+
+A failed action returns exactly one code. Every code belongs to one of the paper's three failure types (Table IV: navigation,
+body adjustment, logical). Codes of a contingency (bad luck that the seed decided) take the type of what the action was about:
+a body movement is navigation, a change of body height is body adjustment, everything else is logical, because what remains for
+the planner is to notice and recover.
+
+Margins are signed: `reach_m` is how far the target lies beyond the arm (positive: too far), `height_m` the change of pelvis
+height that would bring it into reach (negative: move down), `mass_kg` the mass above the limit, `travel_m` the distance that was
+covered before a path was blocked, `gap_m` the distance between the fingers and what they should have touched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from data.records import Action, ActionKind, ActionOutcome, FailureCategory
+
+__all__ = ["FAILURES", "FailureCode", "FailureSpec", "SkillFailure", "category_of", "failed", "succeeded"]
+
+
+class FailureCode(StrEnum):
+    """Machine-readable reason of a failed action; see `FAILURES` for what each one means."""
+
+    TOO_FAR = "TooFar"
+    BLOCKED_PATH = "BlockedPath"
+    NO_FREE_POSE = "NoFreePose"
+    BODY_TOO_HIGH = "BodyTooHigh"
+    BODY_TOO_LOW = "BodyTooLow"
+    HEIGHT_LIMIT = "HeightLimit"
+    OBJECT_NOT_KNOWN = "ObjectNotKnown"
+    HAND_OCCUPIED = "HandOccupied"
+    HAND_EMPTY = "HandEmpty"
+    NOT_PICKUPABLE = "NotPickupable"
+    NEEDS_TWO_HANDS = "NeedsTwoHands"
+    NOT_LIFTABLE = "NotLiftable"
+    TOO_HEAVY = "TooHeavy"
+    NOT_OPENABLE = "NotOpenable"
+    NOT_TOGGLEABLE = "NotToggleable"
+    NOT_RECEPTACLE = "NotReceptacle"
+    RECEPTACLE_CLOSED = "ReceptacleClosed"
+    RECEPTACLE_FULL = "ReceptacleFull"
+    ALREADY_IN_STATE = "AlreadyInState"
+    ALREADY_HELD = "AlreadyHeld"
+    IN_USE = "InUse"
+    ARM_CONFLICT = "ArmConflict"
+    BOTH_HANDS_BUSY = "BothHandsBusy"
+    OBSTRUCTED = "Obstructed"
+    GRASP_MISSED = "GraspMissed"
+    DROPPED = "Dropped"
+    PLACE_MISSED = "PlaceMissed"
+    HANDLE_SLIPPED = "HandleSlipped"
+    OBJECT_BROKEN = "ObjectBroken"
+    SLIPPED = "Slipped"
+    BROKE = "Broke"
+    SPILLED = "Spilled"
+    NOTHING_HAPPENED = "NothingHappened"
+    LOCKED = "Locked"
+
+
+@dataclass(frozen=True, slots=True)
+class FailureSpec:
+    """What a failure code means.
+
+    Attributes:
+        category: the paper's failure type, None for contingency codes, whose type follows from the action.
+        meaning: why the action failed, for people.
+        margins: names of the margins that may accompany the code.
+    """
+
+    category: FailureCategory | None
+    meaning: str
+    margins: tuple[str, ...] = ()
+
+
+_NAV, _BODY, _LOGIC = FailureCategory.NAVIGATION, FailureCategory.BODY_ADJUSTMENT, FailureCategory.LOGICAL
+
+#: Every code with its meaning. A test asserts that the table is complete.
+FAILURES: Final[Mapping[FailureCode, FailureSpec]] = {
+    FailureCode.TOO_FAR: FailureSpec(_NAV, "no pelvis height at this stance brings the target into reach", ("reach_m",)),
+    FailureCode.BLOCKED_PATH: FailureSpec(_NAV, "furniture or a wall stands in the way", ("travel_m",)),
+    FailureCode.NO_FREE_POSE: FailureSpec(_NAV, "the robot can stand nowhere as asked, or there is no way to get there"),
+    FailureCode.BODY_TOO_HIGH: FailureSpec(_BODY, "a lower pelvis at the same stance would reach", ("height_m", "reach_m")),
+    FailureCode.BODY_TOO_LOW: FailureSpec(_BODY, "a higher pelvis at the same stance would reach", ("height_m", "reach_m")),
+    FailureCode.HEIGHT_LIMIT: FailureSpec(_BODY, "the legs are already at the end of their range", ("height_m",)),
+    FailureCode.OBJECT_NOT_KNOWN: FailureSpec(_LOGIC, "no object of that name has been seen in this episode"),
+    FailureCode.HAND_OCCUPIED: FailureSpec(_LOGIC, "the hand already holds something"),
+    FailureCode.HAND_EMPTY: FailureSpec(_LOGIC, "the hand holds nothing"),
+    FailureCode.NOT_PICKUPABLE: FailureSpec(_LOGIC, "the object cannot be picked up"),
+    FailureCode.NEEDS_TWO_HANDS: FailureSpec(_LOGIC, "the object is too big for one hand, Lift it", ("mass_kg",)),
+    FailureCode.NOT_LIFTABLE: FailureSpec(_LOGIC, "the object cannot be lifted with two hands"),
+    FailureCode.TOO_HEAVY: FailureSpec(_LOGIC, "the object exceeds what the arms carry", ("mass_kg",)),
+    FailureCode.NOT_OPENABLE: FailureSpec(_LOGIC, "the object has nothing that opens"),
+    FailureCode.NOT_TOGGLEABLE: FailureSpec(_LOGIC, "the object has no switch"),
+    FailureCode.NOT_RECEPTACLE: FailureSpec(_LOGIC, "nothing can be put on or in the object"),
+    FailureCode.RECEPTACLE_CLOSED: FailureSpec(_LOGIC, "the receptacle is closed"),
+    FailureCode.RECEPTACLE_FULL: FailureSpec(_LOGIC, "no free spot on or in the receptacle fits the object"),
+    FailureCode.ALREADY_IN_STATE: FailureSpec(_LOGIC, "the object already is in the state that the action makes"),
+    FailureCode.ALREADY_HELD: FailureSpec(_LOGIC, "the object is already in a hand"),
+    FailureCode.IN_USE: FailureSpec(_LOGIC, "the object or receptacle is in use by the other arm"),
+    FailureCode.ARM_CONFLICT: FailureSpec(_LOGIC, "the two actions of the step exclude each other"),
+    FailureCode.BOTH_HANDS_BUSY: FailureSpec(_LOGIC, "both hands hold one object"),
+    FailureCode.OBSTRUCTED: FailureSpec(_LOGIC, "in reach, but no pose of the arm gets there without a collision", ("gap_m",)),
+    FailureCode.GRASP_MISSED: FailureSpec(_LOGIC, "the fingers closed without touching the object from two sides", ("gap_m",)),
+    FailureCode.DROPPED: FailureSpec(_LOGIC, "the object was lost on the way"),
+    FailureCode.PLACE_MISSED: FailureSpec(_LOGIC, "the object did not come to rest on or in the receptacle", ("gap_m",)),
+    FailureCode.HANDLE_SLIPPED: FailureSpec(_LOGIC, "the hand moved but the door or drawer did not follow", ("gap_m",)),
+    FailureCode.OBJECT_BROKEN: FailureSpec(_LOGIC, "the object is broken"),
+    FailureCode.SLIPPED: FailureSpec(None, "contingency: the object slipped out of the hand"),
+    FailureCode.BROKE: FailureSpec(None, "contingency: the object fell and broke"),
+    FailureCode.SPILLED: FailureSpec(None, "contingency: the liquid was spilled"),
+    FailureCode.NOTHING_HAPPENED: FailureSpec(None, "contingency: the action had no effect"),
+    FailureCode.LOCKED: FailureSpec(None, "contingency: the door or drawer is stuck for the moment"),
+}
+
+
+class SkillFailure(Exception):
+    """Raised inside a skill to end it with a failure code; the skill runner turns it into an `ActionOutcome`.
+
+    Attributes:
+        code: the reason.
+        margins: signed quantities that explain it.
+        contingency: outcome name when the reason was drawn from a contingency distribution.
+    """
+
+    def __init__(self, code: FailureCode, margins: Mapping[str, float] | None = None, contingency: str = "") -> None:
+        allowed = FAILURES[code].margins
+        unknown = sorted(set(margins or {}) - set(allowed))
+        if unknown:
+            raise ValueError(f"margins {unknown} do not belong to {code.value}; allowed: {list(allowed)}")
+        super().__init__(f"{code.value}: {FAILURES[code].meaning}")
+        self.code = code
+        self.margins = dict(margins or {})
+        self.contingency = contingency
+
+
+def category_of(code: FailureCode, action: Action) -> FailureCategory:
+    """The paper's failure type of a code, given the action that met it."""
+    category = FAILURES[code].category
+    if category is not None:
+        return category
+    if action.name in ("MoveUp", "MoveDown"):
+        return FailureCategory.BODY_ADJUSTMENT
+    return FailureCategory.NAVIGATION if action.spec.kind is ActionKind.BODY else FailureCategory.LOGICAL
+
+
+def failed(action: Action, failure: SkillFailure) -> ActionOutcome:
+    """The outcome of an action that ended with `failure`."""
+    return ActionOutcome(
+        action=action,
+        success=False,
+        code=failure.code.value,
+        category=category_of(failure.code, action),
+        margins={name: round(float(value), 4) for name, value in failure.margins.items()},
+        message=FAILURES[failure.code].meaning,
+        contingency=failure.contingency,
+    )
+
+
+def succeeded(action: Action) -> ActionOutcome:
+    """The outcome of an action whose effect was verified."""
+    return ActionOutcome(action=action, success=True)
