@@ -1,0 +1,1 @@
+"""Tasks: goal predicates, task records, the benchmark and the sampler of training tasks."""
