@@ -1,0 +1,225 @@
+"""Frozen configuration of the model: vision-language backbone, MPE, CSE, point maps, LoRA and the motion tokenizer.
+
+`configs/model/*.yaml` fill these classes; the field names are the paper's where the paper has a name. Every ablation is one
+switch: `mpe.mode=mrope` and `cse.enabled=false` together give the base model, bit for bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+__all__ = [
+    "CseConfig",
+    "LoraConfig",
+    "ModelConfig",
+    "MotionTokenizerConfig",
+    "MpeConfig",
+    "PointMapConfig",
+    "TinyTextConfig",
+    "TinyVisionConfig",
+]
+
+MpeMode = Literal["mrope", "rope_sign", "rope_sign_raw", "rope_radial", "embed_sign", "rope_sign+embed"]
+CentroidName = Literal["body", "arms", "reach"]
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+@dataclass(frozen=True)
+class MpeConfig:
+    """Motion-based position embedding.
+
+    Attributes:
+        mode: `mrope` is Qwen's own embedding; the others are defined in `proprio_mllm.model.mpe`.
+        centroid: which point of the robot's body is projected into the image, see `proprio_mllm.model.geometry`.
+    """
+
+    mode: MpeMode = "rope_sign"
+    centroid: CentroidName = "reach"
+
+
+@dataclass(frozen=True)
+class CseConfig:
+    """Cross-spatial encoder T = MLP(F2D + Phi(F3D)).
+
+    Attributes:
+        enabled: off leaves the visual tokens as they are.
+        source: which part of the point map's output is F3D.
+        literal: the equation as printed; otherwise F2D is added as a residual and the MLP's last layer starts at zero.
+        frame: frame of the points: the camera's, or the robot's pelvis heading frame through its own kinematics.
+        hidden: width of the MLP; 0 takes the language model's.
+    """
+
+    enabled: bool = True
+    source: Literal["tokens", "points", "both"] = "both"
+    literal: bool = False
+    frame: Literal["camera", "pelvis"] = "pelvis"
+    hidden: int = 0
+
+
+@dataclass(frozen=True)
+class PointMapConfig:
+    """Point-map encoder that gives F3D.
+
+    Attributes:
+        encoder: `sim` is our small encoder, `cut3r` the user's checkout and weights, `oracle` the true depth, `none` nothing.
+        width: channels of `sim`'s tokens.
+        depth: transformer blocks of `sim`.
+        checkout: CUT3R's source folder.
+        checkpoint: CUT3R's weights.
+        sha256: the checksum the user expects of `checkpoint`.
+        trust_checkpoint: must be true to unpickle `checkpoint`.
+        size: side of the image that CUT3R sees, pixels.
+    """
+
+    encoder: Literal["sim", "cut3r", "oracle", "none"] = "sim"
+    width: int = 96
+    depth: int = 2
+    checkout: str | None = None
+    checkpoint: str | None = None
+    sha256: str | None = None
+    trust_checkpoint: bool = False
+    size: int = 432
+
+
+@dataclass(frozen=True)
+class LoraConfig:
+    """Low-rank adapters of the language model's projections."""
+
+    rank: int = 16
+    alpha: int = 32
+    dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require(self.rank > 0, f"rank {self.rank} must be positive")
+        _require(0.0 <= self.dropout < 1.0, f"dropout {self.dropout} outside [0, 1)")
+
+
+@dataclass(frozen=True)
+class MotionTokenizerConfig:
+    """Motion VQ-VAE (paper, stage 1).
+
+    Attributes:
+        features: motion features per frame.
+        window: frames of a proprioception window.
+        codes: codebook size.
+        code_dim: width of a code.
+        width: convolution channels.
+        depth: residual blocks per resolution.
+        dilation: growth of the dilation inside a residual stack.
+        down: number of halvings of the frame rate; 2 gives one token per four frames.
+        alpha: weight of the codebook loss.
+        beta: weight of the commitment loss.
+        velocity_weight: weight of the smooth-L1 loss on frame differences.
+        update: moving averages (`ema`, alpha's term is then only logged) or gradients of the codebook loss (`grad`).
+        ema_decay: decay of the moving averages.
+        reset_below: codes whose moving count falls below this are replaced by vectors of the batch.
+    """
+
+    features: int = 48
+    window: int = 64
+    codes: int = 512
+    code_dim: int = 128
+    width: int = 128
+    depth: int = 2
+    dilation: int = 3
+    down: int = 2
+    alpha: float = 1.0
+    beta: float = 0.02
+    velocity_weight: float = 0.5
+    update: Literal["ema", "grad"] = "ema"
+    ema_decay: float = 0.99
+    reset_below: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("features", "window", "codes", "code_dim", "width", "depth", "dilation", "down"):
+            _require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
+        _require(self.window % self.stride == 0, f"window {self.window} must be a multiple of {self.stride}")
+
+    @property
+    def stride(self) -> int:
+        """Frames per token."""
+        return 2**self.down
+
+    @property
+    def window_tokens(self) -> int:
+        """Tokens of one proprioception window."""
+        return self.window // self.stride
+
+
+@dataclass(frozen=True)
+class TinyTextConfig:
+    """Numbers of a language model trained from scratch."""
+
+    hidden: int = 256
+    layers: int = 5
+    heads: int = 8
+    kv_heads: int = 4
+    intermediate: int = 640
+    max_positions: int = 4096
+    rope_theta: float = 10000.0
+
+    def __post_init__(self) -> None:
+        _require(self.hidden % self.heads == 0, f"hidden {self.hidden} must be a multiple of heads {self.heads}")
+        _require(self.heads % self.kv_heads == 0, f"heads {self.heads} must be a multiple of kv_heads {self.kv_heads}")
+        _require((self.hidden // self.heads) % 16 == 0, f"head size {self.hidden // self.heads} must be a multiple of 16")
+
+
+@dataclass(frozen=True)
+class TinyVisionConfig:
+    """Numbers of a vision tower trained from scratch."""
+
+    hidden: int = 192
+    depth: int = 4
+    heads: int = 6
+    intermediate: int = 512
+
+    def __post_init__(self) -> None:
+        _require(self.hidden % self.heads == 0, f"hidden {self.hidden} must be a multiple of heads {self.heads}")
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Everything that makes one model.
+
+    Attributes:
+        name: name of the configuration.
+        weights: folder or hub name of a Qwen2.5-VL checkpoint; None builds `text` and `vision` from scratch.
+        image_size: side of the square image, pixels, a multiple of 28.
+        prompt: `terse` for models that learn the format, `full` for models that read English.
+        vocab_size: rows of the tokenizer trained on the project's text; ignored with `weights`.
+        dtype: parameter type.
+        history: earlier steps shown to the planner.
+        proprioception: whether prompts carry motion tokens.
+    """
+
+    name: str
+    weights: str | None = None
+    image_size: int = 112
+    prompt: Literal["terse", "full"] = "terse"
+    vocab_size: int = 1400
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    history: int = 4
+    proprioception: bool = True
+    text: TinyTextConfig = field(default_factory=TinyTextConfig)
+    vision: TinyVisionConfig = field(default_factory=TinyVisionConfig)
+    lora: LoraConfig = field(default_factory=LoraConfig)
+    mpe: MpeConfig = field(default_factory=MpeConfig)
+    cse: CseConfig = field(default_factory=CseConfig)
+    point_map: PointMapConfig = field(default_factory=PointMapConfig)
+    motion: MotionTokenizerConfig = field(default_factory=MotionTokenizerConfig)
+
+    def __post_init__(self) -> None:
+        _require(self.image_size > 0 and self.image_size % 28 == 0, f"image_size {self.image_size} must be a multiple of 28")
+        _require(
+            not (self.cse.enabled and self.point_map.encoder == "none"),
+            "cse.enabled needs a point map: point_map.encoder 'none' is not allowed; allowed: sim, cut3r, oracle",
+        )
+        _require(
+            not (self.cse.enabled and self.point_map.encoder == "oracle" and self.cse.source != "points"),
+            f"point_map.encoder 'oracle' has points only: cse.source {self.cse.source!r} is not allowed; allowed: points",
+        )

@@ -1,0 +1,223 @@
+"""From examples to batch tensors: images, token ids, position ids, labels.
+
+An `Example` is a conversation and the views it shows. The collator expands each image's pad, computes the position ids of the
+configured MPE mode and masks the labels. Long examples are refused, never cut: a cut inside an image would misalign features.
+
+Shape letters: B batch, S sequence, I images of the batch, P patches, H and W image rows and columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Literal, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from configs.schema.model import ModelConfig
+from data.records import Camera
+from proprio_mllm.model.chat import Message, encode
+from proprio_mllm.model.geometry import centroid
+from proprio_mllm.model.mpe import Centroid, position_ids
+from proprio_mllm.model.processor import ProprioProcessor
+
+__all__ = ["Batch", "Collator", "Example", "ImageBatch", "View"]
+
+IGNORE = -100
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One image with what is known of the robot that took it.
+
+    Attributes:
+        image: (H, W, 3) uint8.
+        camera: the camera, None for images from elsewhere.
+        key_bodies: (K, 3) metres, pelvis heading frame, None when unknown.
+        points_m: (H, W, 3) true points in the camera frame for the oracle point map; NaN where there is none.
+    """
+
+    image: NDArray[np.uint8]
+    camera: Camera | None = None
+    key_bodies: NDArray[np.floating] | None = None
+    points_m: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """A conversation and its views, in the order of the messages' images."""
+
+    messages: tuple[Message, ...]
+    views: tuple[View, ...] = ()
+
+
+class _Movable:
+    """Moves every tensor of a dataclass."""
+
+    def to(self, device: torch.device | str) -> Self:
+        """A copy on `device`."""
+        moved = {}
+        for f in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
+            value = getattr(self, f.name)
+            if isinstance(value, (Tensor, _Movable)):
+                moved[f.name] = value.to(device)
+        return replace(self, **moved)  # type: ignore[type-var]  # every subclass is a dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class ImageBatch(_Movable):
+    """Images of one size.
+
+    Attributes:
+        pixel_values: (P, 1176) patches as Qwen's image processor gives them.
+        grid_thw: (I, 3) patches per image in time, rows and columns.
+        rgb: (I, 3, H, W) uint8, for the point map.
+        grid: (h, w) of the merged tokens, the same for every image.
+        centroids: the robot's place in each image as fractions, or None.
+        camera_in_pelvis: (I, 4, 4), or None when some image has no camera.
+        points_m: (I, H, W, 3) true points, or None when some image has none.
+    """
+
+    pixel_values: Tensor
+    grid_thw: Tensor
+    rgb: Tensor
+    grid: tuple[int, int]
+    centroids: tuple[Centroid | None, ...]
+    camera_in_pelvis: Tensor | None = None
+    points_m: Tensor | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Batch(_Movable):
+    """Model inputs.
+
+    Attributes:
+        input_ids: (B, S).
+        attention_mask: (B, S), 0 on padding.
+        position_ids: (3, B, S).
+        labels: (B, S), -100 where nothing is learnt.
+        images: the images of all rows in order, or None.
+    """
+
+    input_ids: Tensor
+    attention_mask: Tensor
+    position_ids: Tensor
+    labels: Tensor
+    images: ImageBatch | None = None
+
+    @property
+    def supervised(self) -> int:
+        """Number of supervised tokens; the first position of a row predicts nothing and is not counted."""
+        return int((self.labels[:, 1:] != IGNORE).sum())
+
+
+class Collator:
+    """Makes batches.
+
+    Args:
+        processor: tokenizer and image processor.
+        cfg: the model's configuration: MPE mode and centroid provider.
+        max_tokens: longest row that is accepted.
+    """
+
+    def __init__(self, processor: ProprioProcessor, cfg: ModelConfig, max_tokens: int = 4096) -> None:
+        self.processor = processor
+        self.tokenizer = processor.tokenizer
+        self.cfg = cfg
+        self.max_tokens = max_tokens
+        self.image_token: int = processor.tokenizer.get_vocab()[processor.image_token]
+        self._merge = int(processor.image_processor.merge_size)
+
+    def images(self, views: Sequence[View]) -> ImageBatch:
+        """Image tensors of views of one size.
+
+        Raises:
+            ValueError: on no view, images of different sizes or of a wrong type.
+        """
+        if not views:
+            raise ValueError("no views")
+        shapes = {view.image.shape for view in views}
+        if len(shapes) != 1 or next(iter(shapes))[2:] != (3,) or any(view.image.dtype != np.uint8 for view in views):
+            raise ValueError(f"images of a batch must be uint8 (H, W, 3) of one size, got {sorted(shapes)}")
+        features = self.processor.images([view.image for view in views])
+        grid_thw: Tensor = features["image_grid_thw"]
+        h, w = (int(n) // self._merge for n in grid_thw[0, 1:])
+        rgb = torch.from_numpy(np.stack([view.image for view in views])).permute(0, 3, 1, 2)
+        cameras = [view.camera.camera_in_pelvis for view in views if view.camera is not None]
+        points = [view.points_m for view in views if view.points_m is not None]
+        return ImageBatch(
+            pixel_values=features["pixel_values"],
+            grid_thw=grid_thw,
+            rgb=rgb.contiguous(),
+            grid=(h, w),
+            centroids=tuple(self._centroid(view) for view in views),
+            camera_in_pelvis=torch.from_numpy(np.stack(cameras)).float() if len(cameras) == len(views) else None,
+            points_m=torch.from_numpy(np.stack(points)).float() if len(points) == len(views) else None,
+        )
+
+    def _centroid(self, view: View) -> Centroid | None:
+        if view.camera is None or view.key_bodies is None:
+            return None
+        return centroid(view.camera, view.key_bodies, self.cfg.mpe.centroid)
+
+    def __call__(
+        self, examples: Sequence[Example], generation: bool = False, padding: Literal["left", "right"] | None = None
+    ) -> Batch:
+        """Batch of examples.
+
+        Args:
+            examples: conversations.
+            generation: whether to open the assistant's turn at the end of each row.
+            padding: side of the padding; by default left for generation, which needs it, else right.
+
+        Raises:
+            ValueError: on an empty batch, a row that is too long, or views that do not match the messages.
+        """
+        if not examples:
+            raise ValueError("no examples")
+        side = padding or ("left" if generation else "right")
+        if generation and side != "left":
+            raise ValueError("generation needs left padding, got 'right'")
+        views = [view for example in examples for view in example.views]
+        images = self.images(views) if views else None
+        rows: list[tuple[list[int], list[int], Tensor]] = []
+        first = 0
+        for number, example in enumerate(examples):
+            named = sum(m.images for m in example.messages)
+            if named != len(example.views):
+                raise ValueError(f"example {number}: messages name {named} images, but it has {len(example.views)} views")
+            encoded = encode(self.tokenizer, example.messages, generation)
+            ids, labels = self._expand(encoded.ids, encoded.targets, images.grid if images else (0, 0))
+            if len(ids) > self.max_tokens:
+                raise ValueError(f"example {number} has {len(ids)} tokens; at most {self.max_tokens} are allowed")
+            places = images.centroids[first : first + named] if images else ()
+            grids = [images.grid] * named if images else []
+            rows.append((ids, labels, position_ids(ids, self.image_token, grids, places, self.cfg.mpe.mode)))
+            first += named
+        return self._pad(rows, images, side)
+
+    def _expand(self, ids: Sequence[int], targets: Sequence[bool], grid: tuple[int, int]) -> tuple[list[int], list[int]]:
+        out: list[int] = []
+        labels: list[int] = []
+        for token, target in zip(ids, targets, strict=True):
+            count = grid[0] * grid[1] if token == self.image_token else 1
+            out.extend([token] * count)
+            labels.extend([token if target else IGNORE] * count)
+        return out, labels
+
+    def _pad(self, rows: list[tuple[list[int], list[int], Tensor]], images: ImageBatch | None, side: str) -> Batch:
+        size, count = max(len(ids) for ids, _, _ in rows), len(rows)
+        input_ids = torch.full((count, size), int(self.tokenizer.pad_token_id))
+        mask = torch.zeros(count, size, dtype=torch.long)
+        labels = torch.full((count, size), IGNORE)
+        positions = torch.zeros(3, count, size, dtype=torch.long)
+        for row, (ids, targets, place) in enumerate(rows):
+            span = slice(size - len(ids), size) if side == "left" else slice(0, len(ids))
+            input_ids[row, span] = torch.tensor(ids)
+            mask[row, span] = 1
+            labels[row, span] = torch.tensor(targets)
+            positions[:, row, span] = place
+        return Batch(input_ids, mask, positions, labels, images)

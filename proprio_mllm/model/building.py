@@ -1,0 +1,306 @@
+"""Builds, saves and loads models: one path for the model trained from scratch and for released weights.
+
+Order: backbone (config or weights), then the vocabulary, then the wrapper, then adapters when a phase asks for them. A stored
+model is a folder, safetensors and JSON only:
+
+    config.json            the ModelConfig, format version, adapter names
+    processor/             tokenizer, image processor, chat template
+    vlm/                   backbone weights (only when it was built from scratch)
+    heads.safetensors      cse, mpe, point map, and the merger of a released backbone
+    adapters/<name>/       LoRA and motion rows, peft's format
+    motion/                the motion tokenizer, when one was given
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from peft import LoraConfig as PeftLoraConfig
+from peft import PeftModel, get_peft_model
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
+
+from configs.schema.model import ModelConfig
+from configs.validate import build
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.model.point_map import OraclePointMap, SimPointMap
+from proprio_mllm.model.processor import ProprioProcessor, load_processor, make_processor
+from proprio_mllm.model.tokenizer import train_tokenizer
+from proprio_mllm.model.vocabulary import add_motion_tokens
+
+__all__ = [
+    "add_adapter",
+    "build_model",
+    "build_point_map",
+    "build_processor",
+    "load_model",
+    "load_motion",
+    "save_model",
+    "use_adapter",
+]
+
+_FORMAT = 1
+LORA_TARGETS = r".*language_model\.layers\..*(q|k|v|o|gate|up|down)_proj"
+
+
+def build_processor(cfg: ModelConfig, texts: Sequence[str] = (), whole_words: Sequence[str] = ()) -> ProprioProcessor:
+    """The processor of the configured weights, or one around a tokenizer trained on `texts`; motion tokens included.
+
+    Args:
+        cfg: model configuration.
+        texts: training text of the tokenizer; needed without `cfg.weights`.
+        whole_words: words of one token each, such as object type names.
+
+    Raises:
+        ValueError: without weights and without texts.
+    """
+    if cfg.weights is not None:
+        processor = load_processor(cfg.weights, cfg.image_size)
+    elif texts:
+        processor = make_processor(train_tokenizer(texts, cfg.vocab_size, whole_words), cfg.image_size)
+    else:
+        raise ValueError(f"model {cfg.name!r} has no weights: texts are needed to train its tokenizer")
+    add_motion_tokens(processor.tokenizer, cfg.motion.codes)
+    return processor
+
+
+def backbone_config(cfg: ModelConfig, processor: ProprioProcessor) -> Qwen2_5_VLConfig:
+    """Configuration of a backbone from scratch; every token id comes from the tokenizer."""
+    tokenizer, text, vision = processor.tokenizer, cfg.text, cfg.vision
+
+    def token(name: str) -> int:
+        return int(tokenizer.convert_tokens_to_ids(name))
+
+    eighth = text.hidden // text.heads // 16  # halves of the head split 2:3:3 between time, row and column, as in the 7B
+    return Qwen2_5_VLConfig(
+        text_config={
+            "vocab_size": -(-len(tokenizer) // 64) * 64,
+            "hidden_size": text.hidden,
+            "intermediate_size": text.intermediate,
+            "num_hidden_layers": text.layers,
+            "num_attention_heads": text.heads,
+            "num_key_value_heads": text.kv_heads,
+            "max_position_embeddings": text.max_positions,
+            "rope_parameters": {
+                "rope_type": "default",
+                "rope_theta": text.rope_theta,
+                "mrope_section": [2 * eighth, 3 * eighth, 3 * eighth],
+            },
+            "bos_token_id": token("<|endoftext|>"),
+            "eos_token_id": token("<|im_end|>"),
+            "pad_token_id": token("<|endoftext|>"),
+            "tie_word_embeddings": True,
+        },
+        vision_config={
+            "depth": vision.depth,
+            "hidden_size": vision.hidden,
+            "num_heads": vision.heads,
+            "intermediate_size": vision.intermediate,
+            "out_hidden_size": text.hidden,
+            "fullatt_block_indexes": list(range(vision.depth)),
+        },
+        image_token_id=token("<|image_pad|>"),
+        video_token_id=token("<|video_pad|>"),
+        vision_start_token_id=token("<|vision_start|>"),
+        vision_end_token_id=token("<|vision_end|>"),
+        tie_word_embeddings=True,
+    )
+
+
+def build_point_map(cfg: ModelConfig) -> nn.Module | None:
+    """The configured point-map encoder, untrained; None for `none`."""
+    point_map = cfg.point_map
+    if point_map.encoder == "sim":
+        return SimPointMap(point_map.width, point_map.depth)
+    if point_map.encoder == "oracle":
+        return OraclePointMap()
+    if point_map.encoder == "cut3r":
+        from proprio_mllm.model.cut3r import Cut3rPointMap  # imports the user's checkout
+
+        return Cut3rPointMap.from_config(point_map)
+    return None
+
+
+def _extend(vlm: Qwen2_5_VLForConditionalGeneration, size: int) -> None:
+    embeddings: Any = vlm.get_input_embeddings()
+    rows = int(embeddings.num_embeddings)
+    if size > rows:  # released matrices have spare rows; resizing to the tokenizer could shrink them
+        vlm.resize_token_embeddings(size, pad_to_multiple_of=64)
+
+
+def build_model(
+    cfg: ModelConfig, processor: ProprioProcessor, seed: int = 0, point_map: nn.Module | None = None
+) -> ProprioMLLM:
+    """A model without adapters.
+
+    Args:
+        cfg: model configuration.
+        processor: from `build_processor`.
+        seed: of the initial weights of everything that is not loaded.
+        point_map: a trained encoder; by default a fresh one of the configured kind.
+    """
+    dtype = getattr(torch, cfg.dtype)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        if cfg.weights is not None:
+            vlm = Qwen2_5_VLForConditionalGeneration.from_pretrained(cfg.weights, dtype=dtype)
+        else:
+            vlm = Qwen2_5_VLForConditionalGeneration(backbone_config(cfg, processor)).to(dtype)
+        _extend(vlm, len(processor.tokenizer))
+        motion_ids = add_motion_tokens(processor.tokenizer, cfg.motion.codes)
+        if point_map is None and cfg.cse.enabled:
+            point_map = build_point_map(cfg)
+        return ProprioMLLM(vlm, cfg, processor, motion_ids, point_map)
+
+
+def add_adapter(model: ProprioMLLM, name: str = "default") -> None:
+    """Adds LoRA weights and trainable motion rows under a name and makes them the active adapter.
+
+    The first adapter freezes the whole backbone; choose what trains afterwards with `groups.train_only`.
+
+    Raises:
+        ValueError: when the name is taken.
+    """
+    tied = model.core.config.tie_word_embeddings
+    rows: Any = list(model.motion_ids) if tied else {"embed_tokens": list(model.motion_ids), "lm_head": list(model.motion_ids)}
+    lora = PeftLoraConfig(
+        r=model.cfg.lora.rank,
+        lora_alpha=model.cfg.lora.alpha,
+        lora_dropout=model.cfg.lora.dropout,
+        target_modules=LORA_TARGETS,
+        trainable_token_indices=rows,
+    )
+    if isinstance(model.vlm, PeftModel):
+        if name in model.vlm.peft_config:
+            raise ValueError(f"adapter {name!r} exists; present: {', '.join(model.vlm.peft_config)}")
+        model.vlm.add_adapter(name, lora)
+    else:
+        heads = {k: p.requires_grad for k, p in model.named_parameters() if not k.startswith("vlm.")}
+        model.vlm = get_peft_model(model.core, lora, adapter_name=name)  # type: ignore[arg-type]  # peft's stub wants PreTrainedModel
+        for key, parameter in model.named_parameters():
+            if key in heads:
+                parameter.requires_grad_(heads[key])
+    use_adapter(model, name)
+
+
+def use_adapter(model: ProprioMLLM, name: str) -> None:
+    """Makes an adapter the active one.
+
+    Raises:
+        ValueError: when there is no such adapter.
+    """
+    present = list(model.vlm.peft_config) if isinstance(model.vlm, PeftModel) else []
+    if name not in present:
+        raise ValueError(f"no adapter {name!r}; present: {', '.join(present) or 'none'}")
+    assert isinstance(model.vlm, PeftModel)
+    model.vlm.set_adapter(name)
+
+
+def backbone_state(model: ProprioMLLM) -> dict[str, Tensor]:
+    """Weights of the backbone under their plain names, adapters left out."""
+    state: dict[str, Tensor] = {}
+    for name, tensor in model.core.state_dict().items():
+        if "lora_" in name or "trainable_tokens_" in name:
+            continue
+        plain = name.replace(".token_adapter.", ".").replace(".base_layer.", ".")
+        state[plain] = tensor
+    return state
+
+
+def save_model(model: ProprioMLLM, folder: str | Path, motion: MotionTokenizer | None = None) -> None:
+    """Writes a model so that `load_model` gives the same one; the folder appears at once, complete.
+
+    Args:
+        model: the model.
+        folder: replaced when it exists.
+        motion: the motion tokenizer the prompts were made with.
+    """
+    folder = Path(folder)
+    work = folder.with_name(folder.name + ".tmp")
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    model.processor.save_pretrained(str(work / "processor"))
+    state = backbone_state(model)
+    heads = {k: v for k, v in model.state_dict().items() if k.startswith(("cse.", "mpe.", "point_map."))}
+    if model.cfg.weights is None:
+        (work / "vlm").mkdir()
+        if model.core.config.tie_word_embeddings:
+            state.pop("lm_head.weight", None)
+        save_file({k: v.contiguous() for k, v in state.items()}, work / "vlm" / "model.safetensors", {"format": "pt"})
+        model.core.config.save_pretrained(str(work / "vlm"))
+    else:
+        heads |= {f"backbone.{k}": v for k, v in state.items() if ".visual.merger." in k}
+    save_file({k: v.clone().contiguous() for k, v in heads.items()}, work / "heads.safetensors")
+    adapters: list[str] = []
+    if isinstance(model.vlm, PeftModel):
+        adapters = list(model.vlm.peft_config)
+        for name in adapters:
+            model.vlm.save_pretrained(str(work / "adapters"), selected_adapters=[name], save_embedding_layers=False)
+            if name == "default":  # peft writes this one beside the others
+                (work / "adapters" / name).mkdir(exist_ok=True)
+                for file in ("adapter_config.json", "adapter_model.safetensors"):
+                    os.replace(work / "adapters" / file, work / "adapters" / name / file)
+        for stray in (work / "adapters").rglob("README.md"):
+            stray.unlink()
+    if motion is not None:
+        motion.save(work / "motion")
+    stored = {"format": _FORMAT, "config": dataclasses.asdict(model.cfg), "adapters": adapters}
+    (work / "config.json").write_text(json.dumps(stored, indent=2) + "\n", encoding="utf-8")
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(work, folder)
+
+
+def load_model(folder: str | Path, adapter: str | None = None, trainable: bool = False) -> ProprioMLLM:
+    """Reads what `save_model` wrote, in evaluation mode.
+
+    Args:
+        folder: the stored model.
+        adapter: the adapter to make active; by default the first, if any.
+        trainable: whether adapters keep their gradients.
+
+    Raises:
+        ValueError: on an unknown format or adapter.
+    """
+    folder = Path(folder)
+    stored = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    if stored.get("format") != _FORMAT:
+        raise ValueError(f"{folder}: model format {stored.get('format')!r}; this version reads {_FORMAT}")
+    cfg = build(ModelConfig, stored["config"], "model")
+    processor = load_processor(folder / "processor", cfg.image_size)
+    local = dataclasses.replace(cfg, weights=str(folder / "vlm")) if cfg.weights is None else cfg
+    model = build_model(local, processor)
+    model.cfg = cfg
+    heads = load_file(folder / "heads.safetensors")
+    merger = {k.removeprefix("backbone."): v for k, v in heads.items() if k.startswith("backbone.")}
+    model.core.load_state_dict(merger, strict=False)
+    own = {k: v for k, v in heads.items() if not k.startswith("backbone.")}
+    missing = [k for k in model.load_state_dict(own, strict=False).missing_keys if not k.startswith("vlm.")]
+    if missing:
+        raise ValueError(f"{folder}/heads.safetensors lacks {missing[:3]}")
+    names: list[str] = stored["adapters"]
+    for name in names:
+        path = str(folder / "adapters" / name)
+        if isinstance(model.vlm, PeftModel):
+            model.vlm.load_adapter(path, name, is_trainable=trainable)
+        else:
+            model.vlm = PeftModel.from_pretrained(model.core, path, adapter_name=name, is_trainable=trainable)
+    if adapter is not None or names:
+        use_adapter(model, adapter if adapter is not None else names[0])
+        if not trainable:
+            model.vlm.requires_grad_(False)
+    return model.eval()
+
+
+def load_motion(folder: str | Path) -> MotionTokenizer | None:
+    """The motion tokenizer stored with a model, or None."""
+    path = Path(folder) / "motion"
+    return MotionTokenizer.load(path) if path.is_dir() else None

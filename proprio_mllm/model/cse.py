@@ -1,0 +1,88 @@
+"""Cross-spatial encoder (paper: CSE), T = MLP(F2D + Phi(F3D)).
+
+F2D are the merged visual tokens, F3D a point-map encoder's output. The paper leaves open how F3D reaches the tokens' grid: Phi
+here is bilinear interpolation of the tokens to the merged grid, mean points of a 2 x 2 subdivision of each cell, and one linear
+map. As printed the equation destroys pretrained visual tokens at the start, so by default F2D is added as a residual and the
+MLP's last layer starts at zero (off and on are equal at the start); `literal` gives the equation as printed.
+
+Shape letters: I images, h and w rows and columns of the merged grid, N = h * w, D hidden size, C token channels.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from configs.schema.model import CseConfig
+from proprio_mllm.model.point_map import GeoFeatures
+
+__all__ = ["CrossSpatialEncoder"]
+
+#: Points beyond this are held to it, metres.
+FAR_M = 10.0
+
+
+class CrossSpatialEncoder(nn.Module):
+    """Adds three-dimensional features to visual tokens.
+
+    Args:
+        cfg: switches.
+        hidden: D.
+        token_dim: C of the point-map encoder, 0 when it has no tokens.
+    """
+
+    def __init__(self, cfg: CseConfig, hidden: int, token_dim: int) -> None:
+        super().__init__()
+        if cfg.source in ("tokens", "both") and token_dim == 0:
+            raise ValueError(f"cse.source {cfg.source!r} needs a point-map encoder with tokens; allowed without: points")
+        self.cfg = cfg
+        inputs = (0 if cfg.source == "points" else token_dim) + (0 if cfg.source == "tokens" else 16)
+        self.phi = nn.Linear(inputs, hidden)
+        inner = cfg.hidden or hidden
+        self.mlp = nn.Sequential(nn.Linear(hidden, inner), nn.GELU(), nn.Linear(inner, hidden))
+        if not cfg.literal:
+            last = self.mlp[2]
+            assert isinstance(last, nn.Linear)
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+
+    def spatial(self, geo: GeoFeatures, h: int, w: int, camera_in_pelvis: Tensor | None) -> Tensor:
+        """F3D on the merged grid, (I, N, inputs of Phi).
+
+        Args:
+            geo: the encoder's output.
+            h: rows of the merged grid.
+            w: columns.
+            camera_in_pelvis: (I, 4, 4) camera poses, needed when `cfg.frame` is `pelvis`.
+
+        Raises:
+            ValueError: without poses in the pelvis frame.
+        """
+        parts: list[Tensor] = []
+        if self.cfg.source != "points":
+            assert geo.tokens is not None
+            tokens = functional.interpolate(geo.tokens.float(), size=(h, w), mode="bilinear", antialias=True)  # (I, C, h, w)
+            parts.append(tokens.flatten(2).transpose(1, 2))
+        if self.cfg.source != "tokens":
+            points = geo.points_m.float()
+            if self.cfg.frame == "pelvis":
+                if camera_in_pelvis is None:
+                    raise ValueError("cse.frame 'pelvis' needs a camera pose for every image")
+                pose = camera_in_pelvis.to(points)
+                points = torch.einsum("iab,ihwb->ihwa", pose[:, :3, :3], points) + pose[:, None, None, :3, 3]
+            valid = (geo.conf > 0).to(points)
+            planes = torch.cat([points.clamp(-FAR_M, FAR_M) / 2.0, geo.conf.clamp_min(1.0).log()[..., None]], dim=-1)
+            planes = (planes * valid[..., None]).permute(0, 3, 1, 2)  # (I, 4, H, W)
+            pooled = functional.adaptive_avg_pool2d(planes, (2 * h, 2 * w))
+            share = functional.adaptive_avg_pool2d(valid[:, None], (2 * h, 2 * w))
+            pooled = pooled / share.clamp_min(1e-3)  # mean over valid pixels
+            cells = pooled.unflatten(2, (h, 2)).unflatten(4, (w, 2))  # (I, 4, h, 2, w, 2)
+            parts.append(cells.permute(0, 2, 4, 1, 3, 5).reshape(len(cells), h * w, 16))
+        return torch.cat(parts, dim=-1)
+
+    def forward(self, features: Tensor, geo: GeoFeatures, h: int, w: int, camera_in_pelvis: Tensor | None = None) -> Tensor:
+        """T (I, N, D) from F2D (I, N, D)."""
+        spatial = self.spatial(geo, h, w, camera_in_pelvis).to(features.dtype)
+        out = self.mlp(features + self.phi(spatial))
+        return out if self.cfg.literal else features + out

@@ -1,0 +1,234 @@
+"""Proprio-MLLM: Qwen2.5-VL with MPE and CSE, a wrapper that hands visual tokens and position ids to the unchanged model.
+
+The wrapper computes the visual tokens, passes them through the CSE and the additive MPE, and gives them to the model as
+`mm_encoder_outputs` together with position ids from the collator. With `mpe.mode=mrope` and `cse.enabled=false` the result is
+the base model's, bit for bit. The wrapper must be the outermost module under DDP.
+
+Shape letters: B batch, S sequence, I images, N visual tokens per image, D hidden size, V vocabulary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from peft import PeftModel
+from torch import Tensor, nn
+from torch.nn import functional
+from transformers import Qwen2_5_VLForConditionalGeneration
+from transformers.modeling_outputs import BaseModelOutputWithPooling
+
+from configs.schema.model import ModelConfig
+from proprio_mllm.model.batch import IGNORE, Batch, ImageBatch
+from proprio_mllm.model.cse import CrossSpatialEncoder
+from proprio_mllm.model.mpe import SignEmbedding
+from proprio_mllm.model.processor import ProprioProcessor
+
+__all__ = ["ModelOutput", "ProprioMLLM"]
+
+
+@dataclass(frozen=True, slots=True)
+class ModelOutput:
+    """Result of a forward pass.
+
+    Attributes:
+        loss: mean cross-entropy over the supervised tokens; 0 when there is none.
+        supervised: number of supervised tokens, to weigh accumulated batches.
+        correct: number of supervised tokens predicted right (argmax).
+        visual: (I, N, D) visual tokens before CSE and MPE, for dense losses; None without images.
+        logits: (B, S, V) when asked for.
+    """
+
+    loss: Tensor
+    supervised: int
+    correct: int
+    visual: Tensor | None
+    logits: Tensor | None = None
+
+
+class ProprioMLLM(nn.Module):
+    """The whole model.
+
+    Args:
+        vlm: Qwen2.5-VL, or the same wrapped by peft.
+        cfg: switches.
+        processor: tokenizer and image processor; its special ids are never generated.
+        motion_ids: ids of the motion tokens, in the order of `vocabulary.motion_tokens`.
+        point_map: encoder of F3D; needed when CSE is enabled.
+    """
+
+    #: Tells training loops that the loss is already a mean over this batch's supervised tokens.
+    accepts_loss_kwargs = False
+
+    def __init__(
+        self,
+        vlm: Qwen2_5_VLForConditionalGeneration | PeftModel,
+        cfg: ModelConfig,
+        processor: ProprioProcessor,
+        motion_ids: Sequence[int],
+        point_map: nn.Module | None = None,
+    ) -> None:
+        super().__init__()
+        self.vlm = vlm
+        self.cfg = cfg
+        self.processor = processor
+        self.motion_ids = tuple(motion_ids)
+        hidden = self.hidden_size
+        self.point_map = point_map if cfg.cse.enabled else None
+        self.cse: CrossSpatialEncoder | None = None
+        if cfg.cse.enabled:
+            if point_map is None:
+                raise ValueError("cse.enabled needs a point map, got None")
+            encoder: Any = point_map
+            self.cse = CrossSpatialEncoder(cfg.cse, hidden, int(encoder.token_dim))
+            point_map.requires_grad_(False)
+        self.mpe = SignEmbedding(hidden) if cfg.mpe.mode in ("embed_sign", "rope_sign+embed") else None
+        tokenizer = processor.tokenizer
+        names = ("<|image_pad|>", "<|video_pad|>", "<|vision_start|>", "<|vision_end|>", "<|vision_pad|>", "<|im_start|>")
+        rows = self.table.shape[0]
+        # Rows beyond the tokenizer have no text; pads in a reply would ask for images that are not there.
+        self._never = [*tokenizer.convert_tokens_to_ids(list(names)), *range(len(tokenizer), rows)]
+        self._end = int(tokenizer.convert_tokens_to_ids("<|im_end|>"))
+        self._pad = int(tokenizer.pad_token_id)
+
+    @property
+    def core(self) -> Qwen2_5_VLForConditionalGeneration:
+        """The Qwen2.5-VL model itself, adapters (if any) injected."""
+        vlm: Any = self.vlm
+        core: Any = vlm.get_base_model() if isinstance(vlm, PeftModel) else vlm
+        return core
+
+    @property
+    def hidden_size(self) -> int:
+        """Width D of the language model."""
+        text: Any = self.core.config.text_config
+        return int(text.hidden_size)
+
+    @property
+    def table(self) -> Tensor:
+        """Input embeddings (V, D); with adapters, the rows below the replaced ones."""
+        embeddings: Any = self.core.get_input_embeddings()
+        return embeddings.weight
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the parameters."""
+        return next(self.parameters()).device
+
+    def visual_tokens(self, images: ImageBatch) -> Tensor:
+        """Merged visual tokens F2D (I, N, D), raster order, before CSE and MPE."""
+        model: Any = self.core.model  # its decorators hide the signature
+        features = model.get_image_features(images.pixel_values, images.grid_thw, return_dict=True)
+        return torch.stack(features.pooler_output)
+
+    def enrich(self, visual: Tensor, images: ImageBatch) -> Tensor:
+        """Visual tokens (I, N, D) after CSE and the additive MPE."""
+        h, w = images.grid
+        if self.cse is not None:
+            assert self.point_map is not None
+            with torch.no_grad():
+                geo = self.point_map(images.rgb, images.points_m)
+            visual = self.cse(visual, geo, h, w, images.camera_in_pelvis)
+        if self.mpe is not None:
+            visual = visual + torch.stack([self.mpe(h, w, place) for place in images.centroids]).to(visual.dtype)
+        return visual
+
+    def _inputs(self, batch: Batch) -> tuple[dict[str, Any], Tensor | None]:
+        inputs: dict[str, Any] = {
+            "input_ids": batch.input_ids,
+            "attention_mask": batch.attention_mask,
+            "position_ids": batch.position_ids,
+        }
+        if batch.images is None:
+            return inputs, None
+        visual = self.visual_tokens(batch.images)
+        tokens = self.enrich(visual, batch.images)
+        per_image: Any = tuple(tokens)  # one entry per image, as Qwen2.5-VL returns it
+        inputs["mm_encoder_outputs"] = {"image": BaseModelOutputWithPooling(pooler_output=per_image)}
+        return inputs, visual
+
+    def forward(self, batch: Batch, return_logits: bool = False) -> ModelOutput:
+        """Loss of a batch.
+
+        Args:
+            batch: from the collator.
+            return_logits: also compute the logits of every position.
+        """
+        inputs, visual = self._inputs(batch)
+        hidden = self.core.model(**inputs, use_cache=False)[0]  # (B, S, D)
+        # Logits are computed where something is learnt only: V is large, targets are few.
+        target = batch.labels[:, 1:]
+        chosen = target != IGNORE
+        picked = target[chosen]
+        count = int(picked.numel())
+        logits = self.core.lm_head(hidden[:, :-1][chosen]).float()  # (targets, V)
+        loss = functional.cross_entropy(logits, picked, reduction="sum") / max(count, 1)
+        correct = int((logits.detach().argmax(-1) == picked).sum()) if count else 0
+        everything = self.core.lm_head(hidden) if return_logits else None
+        return ModelOutput(loss, count, correct, visual, everything)
+
+    @torch.no_grad()
+    def generate(
+        self,
+        batch: Batch,
+        max_new_tokens: int = 48,
+        temperature: float = 0.0,
+        generator: torch.Generator | None = None,
+    ) -> list[list[int]]:
+        """Continues each row of a left-padded batch.
+
+        Args:
+            batch: from the collator with `generation=True`.
+            max_new_tokens: longest reply.
+            temperature: 0 takes the most likely token, otherwise tokens are drawn.
+            generator: draws the tokens; on the CPU.
+
+        Returns:
+            The new token ids of each row, without the closing token.
+
+        Raises:
+            ValueError: on right padding or a negative temperature.
+        """
+        if temperature < 0:
+            raise ValueError(f"temperature {temperature} must not be negative")
+        if int(batch.attention_mask[:, -1].min()) == 0:
+            raise ValueError("generation needs left padding: the last position of a row is padding")
+        inputs, _ = self._inputs(batch)
+        mask, place = batch.attention_mask, batch.position_ids[:, :, -1:]
+        out = self.core.model(**inputs, use_cache=True)
+        replies: list[list[int]] = [[] for _ in range(len(mask))]
+        done = torch.zeros(len(mask), dtype=torch.bool, device=mask.device)
+        for _ in range(max_new_tokens):
+            logits = self.core.lm_head(out.last_hidden_state[:, -1]).float()  # (B, V)
+            logits[:, self._never] = float("-inf")
+            token = self._choose(logits, temperature, generator)  # (B,)
+            done |= token == self._end
+            if bool(done.all()):
+                break
+            for row, (value, over) in enumerate(zip(token.tolist(), done.tolist(), strict=True)):
+                if not over:
+                    replies[row].append(value)
+            place = place + 1  # text follows text
+            mask = torch.cat([mask, mask.new_ones(len(mask), 1)], dim=1)
+            out = self.core.model(
+                input_ids=token.masked_fill(done, self._pad)[:, None],
+                attention_mask=mask,
+                position_ids=place,
+                past_key_values=out.past_key_values,
+                use_cache=True,
+            )
+        return replies
+
+    @staticmethod
+    def _choose(logits: Tensor, temperature: float, generator: torch.Generator | None) -> Tensor:
+        if temperature == 0:
+            return logits.argmax(-1)
+        shares = (logits / temperature).softmax(-1).cpu()
+        return torch.multinomial(shares, 1, generator=generator)[:, 0].to(logits.device)
+
+    def reply(self, batch: Batch, max_new_tokens: int = 48, temperature: float = 0.0) -> list[str]:
+        """`generate`, decoded to text, motion tokens included."""
+        rows = self.generate(batch, max_new_tokens, temperature)
+        return self.processor.tokenizer.batch_decode(rows, skip_special_tokens=True)

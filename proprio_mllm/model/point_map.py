@@ -1,0 +1,138 @@
+"""Point-map encoders: from an RGB image to 3-D features (paper: CSE, "point-map based features" F3D).
+
+`SimPointMap` is a small network trained on the simulator's depth, the embedded default; it does not claim to equal CUT3R, whose
+adapter is in `proprio_mllm.model.cut3r`. `OraclePointMap` hands through true points, an upper bound.
+
+All points are in the camera frame (x right, y down, z forward), metres. Shape letters: I images, H and W image rows and
+columns, h and w rows and columns of the tokens, C token channels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+__all__ = ["GeoFeatures", "OraclePointMap", "PointMapEncoder", "SimPointMap", "point_map_loss"]
+
+
+@dataclass(frozen=True, slots=True)
+class GeoFeatures:
+    """What a point-map encoder gives.
+
+    Attributes:
+        tokens: (I, C, h, w), or None for encoders without tokens.
+        points_m: (I, H, W, 3) camera frame.
+        conf: (I, H, W), at least 1; 0 marks pixels without a point.
+    """
+
+    tokens: Tensor | None
+    points_m: Tensor
+    conf: Tensor
+
+
+class PointMapEncoder(Protocol):
+    """Anything that turns images into `GeoFeatures`; `token_dim` is C, 0 without tokens."""
+
+    token_dim: int
+
+    def __call__(self, rgb: Tensor, points_m: Tensor | None = None) -> GeoFeatures:
+        """`rgb` is (I, 3, H, W) uint8 or float in [0, 255]; `points_m` are true points, which only the oracle reads."""
+        ...
+
+
+def _pixels(rgb: Tensor) -> Tensor:
+    if rgb.ndim != 4 or rgb.shape[1] != 3:
+        raise ValueError(f"rgb: expected (images, 3, rows, columns), got {tuple(rgb.shape)}")
+    return rgb.float() / 127.5 - 1.0
+
+
+def _convolution(inputs: int, outputs: int, stride: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride, 1), nn.GroupNorm(8, outputs), nn.GELU())
+
+
+class SimPointMap(nn.Module):
+    """Small convolutional and attention encoder with a point and confidence head.
+
+    Tokens are at an eighth of the image's resolution, points are predicted at a quarter and interpolated.
+
+    Args:
+        width: token channels, a multiple of 32.
+        depth: transformer blocks over the tokens.
+    """
+
+    def __init__(self, width: int = 96, depth: int = 2) -> None:
+        super().__init__()
+        if width % 32:
+            raise ValueError(f"point_map.width {width} must be a multiple of 32")
+        self.token_dim = width
+        self.stem = _convolution(5, 32, 2)
+        self.quarter = _convolution(32, 48, 2)
+        self.eighth = _convolution(48, width, 2)
+        self.blocks = nn.ModuleList(
+            nn.TransformerEncoderLayer(width, width // 32, 2 * width, 0.0, "gelu", batch_first=True, norm_first=True)
+            for _ in range(depth)
+        )
+        self.fuse = nn.Sequential(nn.Conv2d(width + 48, 48, 1), nn.GELU(), _convolution(48, 48, 1))
+        self.head = nn.Conv2d(48, 4, 1)
+        with torch.no_grad():
+            nn.init.zeros_(self.head.weight)
+            bias: Any = self.head.bias
+            bias[2] = 1.0  # start 1.7 m ahead
+
+    def forward(self, rgb: Tensor, points_m: Tensor | None = None) -> GeoFeatures:
+        """Tokens, points and confidence of images (I, 3, H, W)."""
+        del points_m
+        x = _pixels(rgb)
+        rows = torch.linspace(-1, 1, x.shape[2], device=x.device).view(1, 1, -1, 1).expand(len(x), 1, -1, x.shape[3])
+        cols = torch.linspace(-1, 1, x.shape[3], device=x.device).view(1, 1, 1, -1).expand(len(x), 1, x.shape[2], -1)
+        quarter = self.quarter(self.stem(torch.cat([x, rows, cols], dim=1)))  # (I, 48, H/4, W/4)
+        grid = self.eighth(quarter)  # (I, C, H/8, W/8)
+        tokens = grid.flatten(2).transpose(1, 2)  # (I, h w, C)
+        for block in self.blocks:
+            tokens = block(tokens)
+        grid = tokens.transpose(1, 2).reshape(grid.shape)
+        up = functional.interpolate(grid, size=quarter.shape[2:], mode="bilinear")
+        raw = self.head(self.fuse(torch.cat([up, quarter], dim=1)))
+        raw = functional.interpolate(raw, size=x.shape[2:], mode="bilinear")  # (I, 4, H, W)
+        # Direction times exp(norm) - 1, as CUT3R's head: the error grows with distance, as depth errors do.
+        norm = raw[:, :3].norm(dim=1, keepdim=True).clamp(1e-6, 5.0)
+        points = raw[:, :3] / raw[:, :3].norm(dim=1, keepdim=True).clamp_min(1e-6) * torch.expm1(norm)
+        conf = 1.0 + raw[:, 3].clamp(max=8.0).exp()
+        return GeoFeatures(grid, points.permute(0, 2, 3, 1), conf)
+
+
+class OraclePointMap(nn.Module):
+    """Hands through the true points; pixels that are not finite get confidence 0."""
+
+    token_dim = 0
+
+    def forward(self, rgb: Tensor, points_m: Tensor | None = None) -> GeoFeatures:
+        """Confidence 1 wherever the true point is finite.
+
+        Raises:
+            ValueError: without true points.
+        """
+        if points_m is None:
+            raise ValueError("point_map.encoder 'oracle' needs true points, but the batch has none")
+        valid = torch.isfinite(points_m).all(dim=-1)
+        return GeoFeatures(None, torch.where(valid[..., None], points_m, 0.0), valid.to(points_m.dtype))
+
+
+def point_map_loss(geo: GeoFeatures, points_m: Tensor, weight: float = 0.2, far_m: float = 20.0) -> Tensor:
+    """CUT3R's confidence-weighted loss, mean of conf * |p - p_true| - weight * log(conf), in metres.
+
+    Args:
+        geo: prediction.
+        points_m: (I, H, W, 3) true points, camera frame; pixels that are not finite or farther than `far_m` are left out.
+        weight: reward of confidence.
+        far_m: largest distance that is learnt.
+    """
+    valid = torch.isfinite(points_m).all(dim=-1)
+    valid &= torch.where(valid[..., None], points_m, 0.0).norm(dim=-1) < far_m
+    error = (geo.points_m - torch.where(valid[..., None], points_m, 0.0)).norm(dim=-1)
+    loss = geo.conf * error - weight * geo.conf.log()
+    return (loss * valid).sum() / valid.sum().clamp_min(1)

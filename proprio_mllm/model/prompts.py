@@ -1,0 +1,213 @@
+"""Every text the model reads or writes, in one place: plans, grounding, motion exercises, judging.
+
+Two styles with the same content: `full` sentences for models that read English, and `terse` for models that learn the format
+from scratch, where every token costs time. In terse lists object ids follow one another without separators (`Mug_1Cup_2`): an
+id starts with a letter and ends with a digit, so the list is unambiguous, and each id is two tokens.
+
+The paper gives its prompts in part; the wording here is ours. A planner's prompt holds only what an `Observation` holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+from data.records import HistoryItem
+from proprio_mllm.model.chat import Message
+from proprio_mllm.model.vocabulary import motion_text
+
+__all__ = [
+    "Style",
+    "answers",
+    "critic_prompt",
+    "described_motion",
+    "filled_motion",
+    "looking",
+    "made_motion",
+    "plan_prompt",
+    "self_ask_prompt",
+    "with_answer",
+]
+
+Style = Literal["terse", "full"]
+
+_SYSTEM: dict[str, dict[Style, str]] = {
+    "plan": {
+        "terse": "plan",
+        "full": (
+            "You plan for a dual-arm humanoid household robot. Reply with the next step only: one action, or two arm actions "
+            "joined by ' & '. Arm actions: Pick, Place, Open, Close, ToggleOn, ToggleOff (arm, object), ResetArm(arm). Two-arm "
+            "actions: Lift, PlaceBoth (object). Body actions: GoTo(object, metres), MoveAhead, MoveBack, MoveLeft, MoveRight, "
+            "MoveUp, MoveDown (metres), RotateLeft, RotateRight (degrees). Done() ends the task. "
+            "Example: Pick(left, Mug_1) & Pick(right, Plate_1)"
+        ),
+    },
+    "look": {"terse": "look", "full": "You answer questions about what the robot sees, relative to its own body."},
+    "judge": {"terse": "judge", "full": "You judge whether a robot reached its goal, from its camera view and its log."},
+    "move": {"terse": "move", "full": "You read and write the robot's motion as motion tokens."},
+}
+
+
+def _system(task: str, style: Style) -> Message:
+    if style not in ("terse", "full"):
+        raise ValueError(f"prompt style {style!r} is not allowed; allowed: terse, full")
+    return Message("system", _SYSTEM[task][style])
+
+
+def _ids(ids: Iterable[str], style: Style) -> str:
+    listed = list(ids)
+    return "".join(listed) if style == "terse" else (", ".join(listed) or "none")
+
+
+def _body(motion: Sequence[int] | None, style: Style) -> str:
+    if motion is None:
+        return ""
+    return motion_text(motion) if style == "terse" else f"Recent body motion: {motion_text(motion)}\n"
+
+
+def _log(history: Sequence[HistoryItem], last: int, style: Style) -> str:
+    shown = list(history)[-last:] if last else []
+    # The feedback repeats the actions with their results; the step alone stands in where there is none.
+    lines = [item.feedback or item.step for item in shown]
+    return ("|" if style == "terse" else "; then ").join(lines) or ("" if style == "terse" else "nothing yet")
+
+
+def plan_prompt(
+    instruction: str,
+    robot: str,
+    visible: Sequence[str],
+    known: Sequence[str],
+    history: Sequence[HistoryItem],
+    step: int,
+    step_budget: int,
+    motion: Sequence[int] | None = None,
+    style: Style = "terse",
+    last: int = 4,
+) -> tuple[Message, ...]:
+    """The planner's prompt about one image; the reply is `PlanStep` text.
+
+    Args:
+        instruction: the task.
+        robot: robot name.
+        visible: ids in view.
+        known: ids seen so far; those in view are not repeated.
+        history: earlier steps, oldest first; the newest `last` are shown.
+        step: index of the coming step, from 0.
+        step_budget: steps that the task allows.
+        motion: motion tokens of the last seconds, None leaves proprioception out.
+        style: terse or full.
+        last: number of earlier steps shown.
+    """
+    seen = set(visible)
+    other = [name for name in known if name not in seen]
+    if style == "terse":
+        text = (
+            f"{_body(motion, style)}{robot} {step + 1}/{step_budget} {instruction}\n"
+            f"see {_ids(visible, style)}\nknow {_ids(other, style)}\ndid {_log(history, last, style)}"
+        )
+    else:
+        text = (
+            f"{_body(motion, style)}Robot: {robot}. Step {step + 1} of {step_budget}.\nTask: {instruction}\n"
+            f"In view: {_ids(visible, style)}\nKnown elsewhere: {_ids(other, style)}\n"
+            f"Last steps: {_log(history, last, style)}\nNext step?"
+        )
+    return (_system("plan", style), Message("user", text, images=1))
+
+
+def with_answer(prompt: Sequence[Message], answer: str) -> tuple[Message, ...]:
+    """The prompt with the assistant's supervised answer."""
+    return (*prompt, Message("assistant", answer))
+
+
+def looking(
+    pairs: Sequence[tuple[str, str]], motion: Sequence[int] | None = None, style: Style = "terse"
+) -> tuple[Message, ...]:
+    """Question and answer pairs about one image as consecutive turns; the image stands before the first question.
+
+    Args:
+        pairs: (question, answer); an empty last answer leaves the conversation open for generation.
+        motion: motion tokens before the first question.
+        style: terse or full.
+
+    Raises:
+        ValueError: without pairs.
+    """
+    if not pairs:
+        raise ValueError("at least one question is needed")
+    messages = [_system("look", style)]
+    for number, (question, answer) in enumerate(pairs):
+        first = number == 0
+        messages.append(Message("user", (_body(motion, style) if first else "") + question, images=int(first)))
+        if answer or number + 1 < len(pairs):
+            messages.append(Message("assistant", answer))
+    return tuple(messages)
+
+
+def described_motion(motion: Sequence[int], caption: str, image: bool = False, style: Style = "terse") -> tuple[Message, ...]:
+    """Motion to text, with or without the view at the motion's end."""
+    ask = "say " if style == "terse" else "Describe this motion: "
+    return with_answer((_system("move", style), Message("user", f"{ask}{motion_text(motion)}", images=int(image))), caption)
+
+
+def made_motion(caption: str, motion: Sequence[int], style: Style = "terse") -> tuple[Message, ...]:
+    """Text to motion."""
+    ask = "do " if style == "terse" else "Write the motion for: "
+    return with_answer((_system("move", style), Message("user", f"{ask}{caption}")), motion_text(motion))
+
+
+def filled_motion(masked: Sequence[int | None], motion: Sequence[int], style: Style = "terse") -> tuple[Message, ...]:
+    """Masked motion: None in `masked` is hidden; the answer is the whole window."""
+    ask = "fill " if style == "terse" else "Fill in the hidden tokens: "
+    return with_answer((_system("move", style), Message("user", f"{ask}{motion_text(masked)}")), motion_text(motion))
+
+
+def critic_prompt(
+    goal: str,
+    visible: Sequence[str],
+    history: Sequence[HistoryItem],
+    motion: Sequence[int] | None = None,
+    style: Style = "terse",
+    last: int = 8,
+) -> tuple[Message, ...]:
+    """Was the goal completed? The reply is `yes` or `no`."""
+    if style == "terse":
+        text = f"{_body(motion, style)}see {_ids(visible, style)}\ndid {_log(history, last, style)}\n{goal}?"
+    else:
+        text = (
+            f"{_body(motion, style)}In view: {_ids(visible, style)}\nLog: {_log(history, last, style)}\n"
+            f'Was the goal "{goal}" completed? Answer yes or no.'
+        )
+    return (_system("judge", style), Message("user", text, images=1))
+
+
+def self_ask_prompt(
+    relation: str,
+    visible: Sequence[str],
+    history: Sequence[HistoryItem],
+    motion: Sequence[int] | None = None,
+    style: Style = "terse",
+    last: int = 8,
+) -> tuple[Message, ...]:
+    """Which objects are in a state? The reply lists ids as `answers` writes them, or `none`.
+
+    Args:
+        relation: what holds of the objects sought, for example `open`, `held`, `on Table_1`.
+        visible: ids in view.
+        history: earlier steps.
+        motion: motion tokens or None.
+        style: terse or full.
+        last: number of earlier steps shown.
+    """
+    if style == "terse":
+        text = f"{_body(motion, style)}see {_ids(visible, style)}\ndid {_log(history, last, style)}\nwhich {relation}?"
+    else:
+        text = (
+            f"{_body(motion, style)}In view: {_ids(visible, style)}\nLog: {_log(history, last, style)}\n"
+            f"Which objects are {relation}? List their ids, or say none."
+        )
+    return (_system("judge", style), Message("user", text, images=1))
+
+
+def answers(ids: Sequence[str]) -> str:
+    """A reply that lists object ids: joined by a comma and a space, `none` when empty."""
+    return ", ".join(ids) or "none"

@@ -1,0 +1,105 @@
+"""Grounding questions about a named object, answered from its position relative to the robot's own body.
+
+Each builder gives a question and the true answer from the object's centre in the pelvis heading frame, which training data
+carries. Answers are words or one action, never raw coordinates. "Proprioceptive" questions depend on the body's shape and
+posture: which arm reaches, and how far the body must go down or up.
+
+Frame: pelvis heading frame, x forward, y left, z up, metres. The bins are ours, the paper names none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Action
+from proprio_mllm.model.geometry import KEY_BODIES, arm_length_m
+from proprio_mllm.model.prompts import Style
+
+__all__ = ["QUESTIONS", "arm_answer", "ask", "body_shift_m", "distance_answer", "height_answer", "shift_answer", "side_answer"]
+
+#: Bearing within which an object counts as ahead, degrees.
+AHEAD_DEG = 8.0
+#: Limits of near and far, metres in the floor plane from the pelvis.
+NEAR_M, FAR_M = 1.0, 2.0
+#: Height relative to the pelvis below and above which an object counts as low and high, metres.
+LOW_M, HIGH_M = -0.15, 0.25
+#: Lateral offset within which either arm does, metres.
+EITHER_M = 0.1
+#: Share of the arm's length that is used, and the distance the robot keeps from an object as a share of that length.
+USABLE, STANDOFF = 0.95, 0.6
+#: Body shifts are rounded to this, metres.
+STEP_M = 0.1
+
+QUESTIONS: Mapping[str, Mapping[Style, str]] = {
+    "side": {"terse": "side {}", "full": "Is {} to the left, ahead or to the right?"},
+    "distance": {"terse": "distance {}", "full": "Is {} near, middle or far?"},
+    "height": {"terse": "height {}", "full": "Is {} low, level or high relative to your pelvis?"},
+    "arm": {"terse": "arm {}", "full": "Which arm reaches {} better: left, right or either?"},
+    "shift": {"terse": "shift {}", "full": "How must your body height change to reach {}? Give MoveDown, MoveUp or none."},
+}
+
+
+def ask(kind: str, name: str, style: Style = "terse") -> str:
+    """The question of a kind about a named object (id or type).
+
+    Raises:
+        ValueError: on an unknown kind.
+    """
+    if kind not in QUESTIONS:
+        raise ValueError(f"question {kind!r} is not allowed; allowed: {', '.join(QUESTIONS)}")
+    return QUESTIONS[kind][style].format(name)
+
+
+def side_answer(center: NDArray[np.floating]) -> str:
+    """`left`, `ahead` or `right` by bearing."""
+    bearing = math.degrees(math.atan2(float(center[1]), float(center[0])))
+    return "ahead" if abs(bearing) <= AHEAD_DEG else ("left" if bearing > 0 else "right")
+
+
+def distance_answer(center: NDArray[np.floating]) -> str:
+    """`near`, `middle` or `far` in the floor plane."""
+    distance = float(np.hypot(center[0], center[1]))
+    return "near" if distance < NEAR_M else ("far" if distance > FAR_M else "middle")
+
+
+def height_answer(center: NDArray[np.floating]) -> str:
+    """`low`, `level` or `high` relative to the pelvis."""
+    return "low" if center[2] < LOW_M else ("high" if center[2] > HIGH_M else "level")
+
+
+def arm_answer(center: NDArray[np.floating]) -> str:
+    """`left`, `right` or `either` by the side on which the object lies."""
+    return "either" if abs(center[1]) <= EITHER_M else ("left" if center[1] > 0 else "right")
+
+
+def body_shift_m(center: NDArray[np.floating], key_bodies: NDArray[np.floating]) -> float:
+    """Change of pelvis height that brings the object into the arms' reach, metres, negative is down, multiples of `STEP_M`.
+
+    The robot may step up to the object until it is `STANDOFF` arm lengths away in the plane; the vertical reach left there is
+    that of a sphere of radius `USABLE` arm lengths around the shoulders.
+
+    Args:
+        center: (3,) object.
+        key_bodies: (K, 3) the robot's own bodies.
+    """
+    length = arm_length_m(key_bodies)
+    shoulders = [KEY_BODIES.index("left_shoulder"), KEY_BODIES.index("right_shoulder")]
+    shoulder_z = float(np.asarray(key_bodies)[shoulders, 2].mean())
+    reach = math.sqrt((USABLE * length) ** 2 - (STANDOFF * length) ** 2)
+    offset = float(center[2]) - shoulder_z
+    if abs(offset) <= reach:
+        return 0.0
+    shift = offset + reach if offset < 0 else offset - reach
+    return math.copysign(math.ceil(abs(shift) / STEP_M - 1e-9) * STEP_M, shift)
+
+
+def shift_answer(center: NDArray[np.floating], key_bodies: NDArray[np.floating]) -> str:
+    """The body action that brings the object into reach, or `none`; at most 1 m."""
+    shift = body_shift_m(center, key_bodies)
+    if shift == 0.0:
+        return "none"
+    return Action("MoveDown" if shift < 0 else "MoveUp", amount=round(min(abs(shift), 1.0), 3)).to_text()
