@@ -159,7 +159,7 @@ class TinyTextConfig:
     layers: int = 5
     heads: int = 8
     kv_heads: int = 4
-    intermediate: int = 640
+    intermediate: int = 512
     max_positions: int = 4096
     rope_theta: float = 10000.0
 

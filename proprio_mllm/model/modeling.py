@@ -157,6 +157,9 @@ class ProprioMLLM(nn.Module):
             return_logits: also compute the logits of every position.
         """
         inputs, visual = self._inputs(batch)
+        if bool((batch.attention_mask.diff(dim=1) <= 0).all()):
+            # Padding stands right of every token, where causal attention never looks: no mask, and the fast kernel.
+            inputs["attention_mask"] = None
         hidden = self.core.model(**inputs, use_cache=False)[0]  # (B, S, D)
         # Logits are computed where something is learnt only: V is large, targets are few.
         target = batch.labels[:, 1:]

@@ -25,7 +25,7 @@ class GeoFeatures:
 
     Attributes:
         tokens: (I, C, h, w), or None for encoders without tokens.
-        points_m: (I, H, W, 3) camera frame.
+        points_m: (I, H, W, 3) camera frame; rows and columns may be coarser than the image's.
         conf: (I, H, W), at least 1; 0 marks pixels without a point.
     """
 
@@ -57,7 +57,7 @@ def _convolution(inputs: int, outputs: int, stride: int) -> nn.Sequential:
 class SimPointMap(nn.Module):
     """Small convolutional and attention encoder with a point and confidence head.
 
-    Tokens are at an eighth of the image's resolution, points are predicted at a quarter and interpolated.
+    Tokens are at an eighth of the image's resolution, points at a quarter.
 
     Args:
         width: token channels, a multiple of 32.
@@ -96,13 +96,11 @@ class SimPointMap(nn.Module):
             tokens = block(tokens)
         grid = tokens.transpose(1, 2).reshape(grid.shape)
         up = functional.interpolate(grid, size=quarter.shape[2:], mode="bilinear")
-        raw = self.head(self.fuse(torch.cat([up, quarter], dim=1)))
-        raw = functional.interpolate(raw, size=x.shape[2:], mode="bilinear")  # (I, 4, H, W)
+        raw = self.head(self.fuse(torch.cat([up, quarter], dim=1))).permute(0, 2, 3, 1)  # (I, H/4, W/4, 4)
         # Direction times exp(norm) - 1, as CUT3R's head: the error grows with distance, as depth errors do.
-        norm = raw[:, :3].norm(dim=1, keepdim=True).clamp(1e-6, 5.0)
-        points = raw[:, :3] / raw[:, :3].norm(dim=1, keepdim=True).clamp_min(1e-6) * torch.expm1(norm)
-        conf = 1.0 + raw[:, 3].clamp(max=8.0).exp()
-        return GeoFeatures(grid, points.permute(0, 2, 3, 1), conf)
+        norm = (raw[..., :3].square().sum(-1, keepdim=True) + 1e-12).sqrt()
+        points = raw[..., :3] / norm * torch.expm1(norm.clamp(max=5.0))
+        return GeoFeatures(grid, points, 1.0 + raw[..., 3].clamp(max=8.0).exp())
 
 
 class OraclePointMap(nn.Module):
@@ -122,17 +120,26 @@ class OraclePointMap(nn.Module):
         return GeoFeatures(None, torch.where(valid[..., None], points_m, 0.0), valid.to(points_m.dtype))
 
 
+def _centres(fine: int, coarse: int) -> Tensor:
+    """Index of the fine pixel at the centre of each coarse one."""
+    return ((torch.arange(coarse) + 0.5) * (fine / coarse)).long()
+
+
 def point_map_loss(geo: GeoFeatures, points_m: Tensor, weight: float = 0.2, far_m: float = 20.0) -> Tensor:
     """CUT3R's confidence-weighted loss, mean of conf * |p - p_true| - weight * log(conf), in metres.
 
     Args:
         geo: prediction.
-        points_m: (I, H, W, 3) true points, camera frame; pixels that are not finite or farther than `far_m` are left out.
+        points_m: (I, H, W, 3) true points, camera frame, read at the centres of the prediction's pixels; those that are not
+            finite or farther than `far_m` are left out.
         weight: reward of confidence.
         far_m: largest distance that is learnt.
     """
-    valid = torch.isfinite(points_m).all(dim=-1)
-    valid &= torch.where(valid[..., None], points_m, 0.0).norm(dim=-1) < far_m
-    error = (geo.points_m - torch.where(valid[..., None], points_m, 0.0)).norm(dim=-1)
+    rows, cols = (_centres(points_m.shape[axis], geo.points_m.shape[axis]) for axis in (1, 2))
+    truth = points_m[:, rows][:, :, cols].to(geo.points_m)
+    valid = torch.isfinite(truth).all(dim=-1)
+    truth = torch.where(valid[..., None], truth, 0.0)
+    valid &= truth.square().sum(-1) < far_m**2
+    error = ((geo.points_m - truth).square().sum(-1) + 1e-12).sqrt()
     loss = geo.conf * error - weight * geo.conf.log()
     return (loss * valid).sum() / valid.sum().clamp_min(1)
