@@ -1,0 +1,86 @@
+"""Goal predicates: every kind in both truth values, nesting, fractions, and what is refused."""
+
+import pytest
+
+from sim.tasks.predicates import Predicate, PredicateError, goal_fraction, goals_hold
+
+
+def entry(object_id, on=(), held=(), **state):
+    record = {"objectId": object_id, "parentReceptacles": list(on), "isPickedUp": bool(held), "heldBy": list(held)}
+    return record | {"isOpen": False, "isToggled": False} | state
+
+
+METADATA = {
+    "objects": [
+        entry("Mug_1", on=["Table_1"]),
+        entry("Apple_1", held=["left"]),
+        entry("Box_1", held=["left", "right"]),
+        entry("Fridge_1", isOpen=True),
+        entry("Lamp_1", isToggled=True),
+        entry("Table_1"),
+    ]
+}
+
+
+@pytest.mark.parametrize(
+    ("predicate", "expected"),
+    [
+        (Predicate("on", "Mug_1", "Table_1"), True),
+        (Predicate("in", "Mug_1", "Fridge_1"), False),
+        (Predicate("held", "Apple_1"), True),
+        (Predicate("held", "Mug_1"), False),
+        (Predicate("lifted", "Box_1"), True),
+        (Predicate("lifted", "Apple_1"), False),
+        (Predicate("open", "Fridge_1"), True),
+        (Predicate("closed", "Fridge_1"), False),
+        (Predicate("closed", "Table_1"), True),
+        (Predicate("toggled_on", "Lamp_1"), True),
+        (Predicate("toggled_off", "Lamp_1"), False),
+        (Predicate("not", of=(Predicate("held", "Mug_1"),)), True),
+        (Predicate("and", of=(Predicate("held", "Apple_1"), Predicate("open", "Fridge_1"))), True),
+        (Predicate("or", of=(Predicate("held", "Mug_1"), Predicate("closed", "Fridge_1"))), False),
+        (Predicate("count", of=(Predicate("held", "Mug_1"), Predicate("held", "Apple_1")), at_least=1), True),
+        (Predicate("count", of=(Predicate("held", "Mug_1"), Predicate("held", "Apple_1")), at_least=2), False),
+    ],
+)
+def test_truth(predicate, expected):
+    assert predicate.holds(METADATA) is expected
+
+
+def test_a_held_object_is_on_nothing():
+    metadata = {"objects": [entry("Mug_1", on=["Table_1"], held=["left"]), entry("Table_1")]}
+    assert not Predicate("on", "Mug_1", "Table_1").holds(metadata)
+
+
+def test_fraction_counts_conditions():
+    goals = (Predicate("held", "Apple_1"), Predicate("held", "Mug_1"), Predicate("open", "Fridge_1"))
+    assert goal_fraction(goals, METADATA) == pytest.approx(2 / 3)
+    assert not goals_hold(goals, METADATA)
+    assert goals_hold(goals[::2], METADATA)
+
+
+def test_json_has_only_the_arguments_of_the_kind():
+    predicate = Predicate("not", of=(Predicate("held", "Mug_1"),))
+    assert predicate.to_json() == {"kind": "not", "of": [{"kind": "held", "object_id": "Mug_1"}]}
+    assert predicate.object_ids() == ("Mug_1",)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"kind": "near", "object_id": "Mug_1"}, "near"),
+        ({"kind": "on", "object_id": "Mug_1"}, "receptacle_id"),
+        ({"kind": "held", "object_id": "Mug_1", "receptacle_id": "Table_1"}, "Table_1"),
+        ({"kind": "not", "of": (Predicate("held", "A_1"), Predicate("held", "B_1"))}, "got 2"),
+        ({"kind": "count", "of": (Predicate("held", "A_1"),), "at_least": 2}, "at_least 2"),
+    ],
+)
+def test_malformed_predicates_are_refused(arguments, message):
+    with pytest.raises(PredicateError, match=message):
+        Predicate(**arguments)
+
+
+@pytest.mark.parametrize("predicate", [Predicate("held", "Ghost_1"), Predicate("on", "Mug_1", "Ghost_1")])
+def test_unknown_objects_are_named(predicate):
+    with pytest.raises(PredicateError, match="Ghost_1"):
+        predicate.holds(METADATA)
