@@ -1,0 +1,101 @@
+"""What both robots' MJCF share: collision bits, servo gains, geometry given in world coordinates at the zero pose.
+
+Collision bits of the whole simulator (`contype`/`conaffinity`): furniture and floor 1, movable objects 2, robot hands and forearms 4.
+Hands touch furniture and objects; the robot does not touch itself (self-collision is the inverse kinematics' business) and legs
+and trunk touch nothing, because the base moves on planned free paths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["HAND_FRICTION", "NO_CONTACT", "ROBOT_AFFINITY", "ROBOT_BIT", "add_servo", "shell", "tune_joint", "zero_pose"]
+
+ROBOT_BIT = 4
+ROBOT_AFFINITY = 3
+HAND_FRICTION = (1.5, 0.02, 0.001)
+NO_CONTACT = {"contype": 0, "conaffinity": 0}
+
+
+def tune_joint(joint: mujoco.MjsJoint, armature: float, damping: float) -> None:
+    """Sets reflected inertia (kg m²) and damping (N m s/rad)."""
+    joint.armature = armature
+    joint.damping = [damping, 0.0, 0.0]
+
+
+def add_servo(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, stiffness: float, force: float) -> None:
+    """Adds a position servo named like its joint; `stiffness` in N m/rad (or N/m), `force` its limit in N m (or N)."""
+    servo = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    servo.set_to_position(kp=stiffness)
+    servo.ctrlrange = joint.range
+    servo.ctrllimited = True
+    servo.forcerange = [-force, force]
+    servo.forcelimited = True
+
+
+def zero_pose(spec: mujoco.MjSpec) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """World position and (3, 3) rotation of every body at the zero pose."""
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return {model.body(i).name: (data.xpos[i].copy(), data.xmat[i].reshape(3, 3).copy()) for i in range(1, model.nbody)}
+
+
+def shell(
+    body: mujoco.MjsBody,
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]],
+    start: Sequence[float],
+    end: Sequence[float],
+    radius: float,
+    rgba: Sequence[float],
+    *,
+    name: str = "",
+    collides: bool = False,
+) -> None:
+    """Adds a massless capsule between two points given in the world at the zero pose."""
+    origin, rotation = pose
+    a, b = rotation.T @ (np.asarray(start) - origin), rotation.T @ (np.asarray(end) - origin)
+    bits = {"contype": ROBOT_BIT, "conaffinity": ROBOT_AFFINITY} if collides else NO_CONTACT
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        size=[radius, 0.0, 0.0],
+        fromto=[*a, *b],
+        rgba=list(rgba),
+        mass=0.0,
+        group=2,
+        **bits,
+    )
+
+
+def shell_box(
+    body: mujoco.MjsBody,
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]],
+    centre: Sequence[float],
+    half: Sequence[float],
+    rgba: Sequence[float],
+    *,
+    name: str = "",
+    collides: bool = False,
+) -> None:
+    """Adds a massless box aligned with the world at the zero pose."""
+    origin, rotation = pose
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, rotation.T.flatten())
+    bits = {"contype": ROBOT_BIT, "conaffinity": ROBOT_AFFINITY} if collides else NO_CONTACT
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=list(half),
+        pos=rotation.T @ (np.asarray(centre) - origin),
+        quat=quat,
+        rgba=list(rgba),
+        mass=0.0,
+        group=2,
+        friction=list(HAND_FRICTION),
+        **bits,
+    )
