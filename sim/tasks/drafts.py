@@ -88,11 +88,21 @@ class Draft:
     goals: list[Predicate] = field(default_factory=list)
     focus: dict[str, str] = field(default_factory=dict)
 
-    def sentences(self, furniture: Sequence[str], rng: np.random.Generator) -> tuple[str, ...]:
-        """The family's wordings for this draft, in random order."""
+    def sentences(self, furniture: Sequence[str], rng: np.random.Generator, hidden: Sequence[str] = ()) -> tuple[str, ...]:
+        """The family's wordings for this draft, in random order.
+
+        Args:
+            furniture: ids of the room's own objects.
+            rng: order of the sentences.
+            hidden: objects that the robot does not see at the start, so that the instruction has to say where they are.
+        """
         own = frozenset(furniture)
         scene: dict[str, str | None] = dict.fromkeys(furniture) | dict(self.objects)
-        slots = {slot: phrase(object_id, scene, own) for slot, object_id in self.focus.items()}
+        named = set(self.focus.values())
+        slots = {
+            slot: phrase(object_id, scene, own, located=object_id in hidden and scene[object_id] not in named)
+            for slot, object_id in self.focus.items()
+        }
         for slot, word in (("r", "pr"), ("s", "ps")):
             if slot in self.focus:
                 slots[word] = preposition(self.focus[slot])

@@ -1,8 +1,9 @@
 """Wording of tasks: natural names of objects and sentence templates per task family.
 
 Names are what people say ("the coffee table", not `CoffeeTable_1`). Where a scene holds several things of one type, furniture
-is counted ("the second cabinet", by its id) and small objects are told apart by where they stand ("the mug on the side table"),
-so that an instruction always means exactly one object. Paper: natural-language instructions of the DualTHOR tasks.
+is counted ("the second cabinet", by its id) and small objects are told apart by where they stand ("the mug from the side table"),
+so that an instruction always means exactly one object. The same wording tells where to look for an object that is out of sight
+at the start. Paper: natural-language instructions of the DualTHOR tasks.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ TEMPLATES: Final[Mapping[str, tuple[str, ...]]] = {
         "Grab {a}.",
         "Please get hold of {a}.",
         "I need {a}, pick it up.",
-        "Find {a} and pick it up.",
+        "Go and get {a}.",
     ),
     "place": (
         "Put {a} {pr} {r}.",
@@ -50,7 +51,7 @@ TEMPLATES: Final[Mapping[str, tuple[str, ...]]] = {
         "Bring {a} over and set it {pr} {r}.",
         "{a} belongs {pr} {r}, please put it there.",
         "Place {a} {pr} {r}.",
-        "Find {a} and put it {pr} {r}.",
+        "Fetch {a} and put it {pr} {r}.",
     ),
     "open": (
         "Open {a}.",
@@ -189,13 +190,14 @@ def preposition(object_id: str) -> str:
     return "in" if object_id.rsplit("_", 1)[0] in _ENCLOSING else "on"
 
 
-def phrase(object_id: str, scene: Mapping[str, str | None], furniture: frozenset[str]) -> str:
+def phrase(object_id: str, scene: Mapping[str, str | None], furniture: frozenset[str], located: bool = False) -> str:
     """A noun phrase with article that means one object of a scene.
 
     Args:
         object_id: the object.
         scene: for every object of the scene, the id of what carries it (None for furniture).
         furniture: ids of the room's own objects.
+        located: whether the phrase says where a movable object is even when its name alone is unique.
 
     Raises:
         KeyError: when the scene does not hold the object.
@@ -205,14 +207,16 @@ def phrase(object_id: str, scene: Mapping[str, str | None], furniture: frozenset
     object_type, number = object_id.rsplit("_", 1)
     name = natural_name(object_type)
     same = [other for other in scene if other.rsplit("_", 1)[0] == object_type]
-    if len(same) == 1:
-        return f"the {name}"
-    carriers = [scene[other] for other in same]
     carrier = scene[object_id]
-    if object_id not in furniture and carrier is not None and carriers.count(carrier) == 1:
-        return f"the {name} {preposition(carrier)} {phrase(carrier, scene, furniture)}"
+    movable = object_id not in furniture and carrier is not None
+    place = f" from {phrase(carrier, scene, furniture)}" if movable and carrier is not None else ""
+    if len(same) == 1:
+        return f"the {name}{place if located else ''}"
+    if movable and [scene[other] for other in same].count(carrier) == 1:
+        return f"the {name}{place}"
     rank = int(number) - 1
-    return f"the {_ORDINALS[rank] if rank < len(_ORDINALS) else number} {name}"
+    ordinal = _ORDINALS[rank] if rank < len(_ORDINALS) else number
+    return f"the {ordinal} {name}{place if located else ''}"
 
 
 def wordings(family: str, slots: Mapping[str, str]) -> tuple[str, ...]:

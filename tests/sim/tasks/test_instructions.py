@@ -34,13 +34,19 @@ def test_natural_names(object_type, name):
     [
         ("Apple_1", "the apple"),
         ("Cabinet_2", "the second cabinet"),
-        ("Mug_1", "the mug on the side table"),
-        ("Mug_2", "the mug in the second cabinet"),
+        ("Mug_1", "the mug from the side table"),
+        ("Mug_2", "the mug from the second cabinet"),
         ("Fork_2", "the second fork"),
     ],
 )
 def test_phrases_mean_one_object(object_id, text):
     assert phrase(object_id, SCENE, FURNITURE) == text
+
+
+def test_a_located_phrase_says_where_to_look():
+    assert phrase("Apple_1", SCENE, FURNITURE, located=True) == "the apple from the side table"
+    assert phrase("Cabinet_1", SCENE, FURNITURE, located=True) == "the first cabinet"
+    assert phrase("Fork_1", SCENE, FURNITURE, located=True) == "the first fork from the side table"
 
 
 def test_phrases_of_a_scene_differ():
