@@ -335,7 +335,7 @@ def _carry_and_place(b: _Builder) -> None:
     _carry(b)
     r = b.draft.focus["r"]
     s = b.choose([place for place in b.scene.surfaces if place != r], "second surface")
-    c = b.small(s, avoid=(r, s, b.draft.objects[b.draft.focus["a"]]))
+    c = b.small(s, avoid=(s,))
     b.ask(_located(c, s), b=c, s=s)
 
 

@@ -1,8 +1,8 @@
 """Wording of tasks: natural names of objects and sentence templates per task family.
 
 Names are what people say ("the coffee table", not `CoffeeTable_1`). Where a scene holds several things of one type, furniture
-is counted ("the second cabinet", by its id) and small objects are told apart by where they stand ("the mug from the side table"),
-so that an instruction always means exactly one object. The same wording tells where to look for an object that is out of sight
+is counted ("the second cabinet", by its id) and small objects are told apart by where they stand ("the mug from the side
+table"), so that an instruction always means exactly one object. The same wording tells where to look for an object that is out of sight
 at the start. Paper: natural-language instructions of the DualTHOR tasks.
 """
 

@@ -11,9 +11,9 @@ SCENE = Scene(
     surfaces=("CounterTop_1", "DiningTable_1", "SideTable_1"),
     containers=("Fridge_1",),
     switches=("Faucet_1",),
-    small={
-        name: ("CounterTop_1", "DiningTable_1", "SideTable_1", "Fridge_1") for name in ("Mug", "Apple", "Bowl", "Bottle", "Egg")
-    },
+    small=dict.fromkeys(
+        ("Mug", "Apple", "Bowl", "Bottle", "Egg"), ("CounterTop_1", "DiningTable_1", "SideTable_1", "Fridge_1")
+    ),
     big={"Box": ("DiningTable_1", "SideTable_1")},
 )
 ALL = [family for families in FAMILIES.values() for family in families]
