@@ -1,15 +1,15 @@
 """Adapter to the user's own CUT3R (paper: CSE's point-map encoder).
 
-CUT3R's code and weights are CC BY-NC-SA 4.0, so nothing of it is kept here: the adapter imports the user's checkout and reads the
-user's weights. Two things its own loader does are not done: it never evaluates text from the checkpoint (sizes are stated
-below), and it does not unpickle a file unasked. A `.safetensors` file is read as it is; a `.pth` file needs the expected sha256,
-is read with PyTorch's restricted unpickler where that suffices, and otherwise only when `trust_checkpoint` is set.
+CUT3R's code and weights are CC BY-NC-SA 4.0, so nothing of it is kept here: the adapter imports the user's checkout and reads
+the user's weights. Two things its own loader does are not done: it never evaluates text from the checkpoint (sizes are stated
+below), and it does not unpickle a file unasked. A `.safetensors` file is read as it is; a `.pth` file needs the expected
+sha256, is read with PyTorch's restricted unpickler where that suffices, and otherwise only when `trust_checkpoint` is set.
 
-CUT3R gives the pose token the position -1, which its PyTorch rotary embedding cannot look up; the adapter puts in `FloatRope2d`,
-which computes the angles instead and is equal where both work.
+CUT3R gives the pose token the position -1, which its PyTorch rotary embedding cannot look up; the adapter puts in
+`FloatRope2d`, which computes the angles instead and is equal where both work.
 
-Points come in CUT3R's own camera frame (x right, y down, z forward) and scale. Shape letters: I images, H and W rows and columns
-of the resized image, h and w of its patches.
+Points come in CUT3R's own camera frame (x right, y down, z forward) and scale. Shape letters: I images, H and W rows and
+columns of the resized image, h and w of its patches.
 """
 
 from __future__ import annotations
@@ -153,7 +153,11 @@ class Cut3rPointMap(nn.Module):
             if isinstance(getattr(module, "rope", None), nn.Module):
                 module.rope = FloatRope2d(100.0)
         norm = network.get_submodule("dec_norm")
-        norm.register_forward_hook(lambda _module, _inputs, output: self._tokens.append(output))
+        norm.register_forward_hook(self._keep)
+
+    def _keep(self, module: nn.Module, inputs: Any, output: Any) -> None:
+        del module, inputs
+        self._tokens.append(output)
 
     @staticmethod
     def from_config(cfg: PointMapConfig, sizes: Mapping[str, Any] = CUT3R_512) -> Cut3rPointMap:
