@@ -2,8 +2,8 @@
 
 Names are what people say ("the coffee table", not `CoffeeTable_1`). Where a scene holds several things of one type, furniture
 is counted ("the second cabinet", by its id) and small objects are told apart by where they stand ("the mug from the side
-table"), so that an instruction always means exactly one object. The same wording tells where to look for an object that is out of sight
-at the start. Paper: natural-language instructions of the DualTHOR tasks.
+table"), so that an instruction always means exactly one object. The same wording tells where to look for an object that is
+out of sight at the start. Paper: natural-language instructions of the DualTHOR tasks.
 """
 
 from __future__ import annotations
