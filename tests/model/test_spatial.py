@@ -1,0 +1,178 @@
+"""Point maps, CSE, dense head."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from configs.schema.model import CseConfig, PointMapConfig
+from proprio_mllm.model.batch import Collator
+from proprio_mllm.model.building import build_model, build_point_map
+from proprio_mllm.model.cse import CrossSpatialEncoder
+from proprio_mllm.model.dense import DenseHead, dense_targets
+from proprio_mllm.model.point_map import GeoFeatures, OraclePointMap, SimPointMap, point_map_loss
+
+
+def _geo(points: torch.Tensor, channels: int = 0) -> GeoFeatures:
+    tokens = torch.randn(len(points), channels, 4, 4) if channels else None
+    return GeoFeatures(tokens, points, torch.ones(points.shape[:3]))
+
+
+def test_points_reach_their_cells_in_the_pelvis_frame():
+    encoder = CrossSpatialEncoder(CseConfig(source="points", frame="pelvis"), hidden=8, token_dim=0)
+    points = torch.zeros(1, 8, 8, 3)
+    points[0, :, :, 2] = 2.0  # 2 m in front of the camera
+    points[0, 2, 5] = torch.tensor([0.4, 0.0, 2.0])
+    pose = torch.eye(4)[None].clone()
+    pose[0, :3, :3] = torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    pose[0, :3, 3] = torch.tensor([0.1, 0.0, 0.6])
+    out = encoder.spatial(_geo(points), 2, 2, pose).reshape(1, 2, 2, 4, 2, 2)  # cell row, column; x y z conf; sub-cell
+    assert torch.allclose(out[0, 1, 0, 0], torch.tensor(2.1 / 2))  # x forward, half scale
+    assert torch.allclose(out[0, 1, 0, 2], torch.tensor(0.6 / 2))
+    # Pixel (2, 5) is in cell (0, 1), sub-cell (1, 0) of four pixels: mean y is -0.4 / 4.
+    assert out[0, 0, 1, 1, 1, 0] == pytest.approx(-0.1 / 2)
+    with pytest.raises(ValueError, match="camera pose"):
+        encoder.spatial(_geo(points), 2, 2, None)
+
+
+def test_missing_points_do_not_pull_the_mean():
+    encoder = CrossSpatialEncoder(CseConfig(source="points", frame="camera"), hidden=8, token_dim=0)
+    truth = torch.full((1, 4, 4, 3), 3.0)
+    truth[0, 0, 0] = torch.nan
+    geo = OraclePointMap()(torch.zeros(1, 3, 4, 4), truth)
+    assert geo.conf[0, 0, 0] == 0
+    out = encoder.spatial(geo, 1, 1, None).reshape(4, 2, 2)
+    torch.testing.assert_close(out[:3], torch.full((3, 2, 2), 1.5))
+    with pytest.raises(ValueError, match="needs true points"):
+        OraclePointMap()(torch.zeros(1, 3, 4, 4))
+
+
+@pytest.mark.parametrize("source", ["tokens", "points", "both"])
+def test_residual_starts_as_identity_and_literal_is_the_equation(source):
+    geo, features = _geo(torch.randn(2, 8, 8, 3), channels=5), torch.randn(2, 16, 8)
+    residual = CrossSpatialEncoder(CseConfig(source=source, frame="camera"), 8, 5)
+    assert torch.equal(residual(features, geo, 4, 4), features)
+    literal = CrossSpatialEncoder(CseConfig(source=source, frame="camera", literal=True), 8, 5)
+    expected = literal.mlp(features + literal.phi(literal.spatial(geo, 4, 4, None)))
+    assert torch.equal(literal(features, geo, 4, 4), expected)
+
+
+def test_tokens_need_an_encoder_with_tokens():
+    with pytest.raises(ValueError, match=r"cse\.source 'both'"):
+        CrossSpatialEncoder(CseConfig(source="both"), 8, 0)
+
+
+def test_point_map_loss_against_a_loop():
+    torch.manual_seed(0)
+    points, truth, conf = torch.randn(2, 3, 3, 3), torch.randn(2, 6, 6, 3), 1 + torch.rand(2, 3, 3)
+    truth[0, 1, 1] = torch.nan
+    truth[1, 3, 3] = 30.0
+    total, count = 0.0, 0
+    for i in range(2):
+        for r in range(3):
+            for c in range(3):
+                target = truth[i, 2 * r + 1, 2 * c + 1]
+                if torch.isfinite(target).all() and target.norm() < 20:
+                    total += float(conf[i, r, c] * (points[i, r, c] - target).norm() - 0.2 * conf[i, r, c].log())
+                    count += 1
+    assert count == 16
+    assert float(point_map_loss(GeoFeatures(None, points, conf), truth)) == pytest.approx(total / count, rel=1e-5)
+
+
+def test_sim_point_map_learns_a_plane():
+    torch.manual_seed(0)
+    encoder = SimPointMap(32, 1)
+    rgb = torch.randint(0, 256, (2, 3, 56, 56), dtype=torch.uint8)
+    truth = torch.zeros(2, 56, 56, 3)
+    truth[..., 2] = 3.0
+    optimiser = torch.optim.AdamW(encoder.parameters(), 3e-3)
+    losses = []
+    for _ in range(30):
+        loss = point_map_loss(encoder(rgb), truth)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    geo = encoder(rgb)
+    assert geo.tokens.shape == (2, 32, 7, 7)
+    assert geo.points_m.shape == (2, 14, 14, 3)
+    assert geo.conf.min() >= 1
+    assert losses[-1] < losses[0] / 2
+    with pytest.raises(ValueError, match="rgb"):
+        encoder(rgb[0])
+    with pytest.raises(ValueError, match="multiple of 32"):
+        SimPointMap(40)
+
+
+def test_build_point_map(cfg):
+    assert isinstance(build_point_map(cfg), SimPointMap)
+    oracle = dataclasses.replace(cfg, cse=CseConfig(source="points"), point_map=PointMapConfig(encoder="oracle"))
+    assert isinstance(build_point_map(oracle), OraclePointMap)
+    none = dataclasses.replace(cfg, cse=CseConfig(enabled=False), point_map=PointMapConfig(encoder="none"))
+    assert build_point_map(none) is None
+
+
+def test_oracle_reads_the_views_points(cfg, processor, examples, shake):
+    oracle = dataclasses.replace(cfg, cse=CseConfig(source="points"), point_map=PointMapConfig(encoder="oracle"))
+    model = build_model(oracle, processor)
+    shake(model)
+    collate = Collator(processor, oracle)
+
+    def loss(scale: float) -> float:
+        points = np.full((112, 112, 3), scale, dtype=np.float32)
+        shown = [dataclasses.replace(e, views=(dataclasses.replace(e.views[0], points_m=points),)) for e in examples]
+        return float(model(collate(shown)).loss.detach())
+
+    assert loss(1.0) != loss(2.0)
+
+
+def test_dense_targets_against_a_loop():
+    torch.manual_seed(0)
+    segmentation = torch.randint(-1, 3, (2, 8, 8))
+    points = torch.randn(2, 8, 8, 3)
+    points[0, 0, 0] = torch.nan
+    points[1, :4, :4] = 100.0
+    targets = dense_targets(segmentation, points, (2, 2), 3)
+    for i in range(2):
+        for cell in range(4):
+            r, c = 4 * (cell // 2), 4 * (cell % 2)
+            labels = segmentation[i, r : r + 4, c : c + 4].flatten()
+            for kind in range(3):
+                assert targets.types[i, cell, kind] == pytest.approx(float((labels == kind).float().mean()))
+            part = points[i, r : r + 4, c : c + 4].reshape(-1, 3)
+            part = part[torch.isfinite(part).all(-1) & (part.norm(dim=-1) < 10)]
+            assert bool(targets.valid[i, cell]) == bool(len(part))
+            if len(part):
+                torch.testing.assert_close(targets.points_m[i, cell], part.mean(0))
+    with pytest.raises(ValueError, match="not a multiple of the grid"):
+        dense_targets(segmentation, points, (3, 2), 3)
+    with pytest.raises(ValueError, match="type index 2"):
+        dense_targets(segmentation, points, (2, 2), 2)
+
+
+def test_dense_head_is_tied_to_names_and_learns(cfg, build, examples):
+    model, collate = build(cfg)
+    head = DenseHead(model, ["Mug", "Fridge", "a long name"])
+    names = head.names(model.table)
+    row = model.processor.tokenizer("Mug", add_special_tokens=False)["input_ids"]
+    assert len(row) == 1
+    torch.testing.assert_close(names[0], model.table[row[0]])
+    long = model.processor.tokenizer("a long name", add_special_tokens=False)["input_ids"]
+    torch.testing.assert_close(names[2], model.table[long].mean(0))
+    images = collate.images([view for example in examples for view in example.views])
+    segmentation = torch.full((3, 112, 112), -1)
+    segmentation[:, :56] = 0
+    points = torch.ones(3, 112, 112, 3)
+    targets = dense_targets(segmentation, points, images.grid, 3)
+    model.train()
+    optimiser = torch.optim.AdamW([*model.parameters(), *head.parameters()], 3e-3)
+    for _ in range(25):
+        loss = head(model.visual_tokens(images), model.table, targets)
+        optimiser.zero_grad()
+        loss.total.backward()
+        optimiser.step()
+    assert loss.recall > 0.9
+    assert loss.point_error_m < 0.5
+    with pytest.raises(ValueError, match="type_names is empty"):
+        DenseHead(model, [])
