@@ -7,13 +7,24 @@ and trunk touch nothing, because the base moves on planned free paths.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["HAND_FRICTION", "NO_CONTACT", "ROBOT_AFFINITY", "ROBOT_BIT", "add_servo", "shell", "tune_joint", "zero_pose"]
+__all__ = [
+    "HAND_FRICTION",
+    "NO_CONTACT",
+    "ROBOT_AFFINITY",
+    "ROBOT_BIT",
+    "add_landmarks",
+    "add_servo",
+    "shell",
+    "shell_box",
+    "tune_joint",
+    "zero_pose",
+]
 
 ROBOT_BIT = 4
 ROBOT_AFFINITY = 3
@@ -99,3 +110,21 @@ def shell_box(
         friction=list(HAND_FRICTION),
         **bits,
     )
+
+
+def add_landmarks(
+    body: mujoco.MjsBody,
+    points: Mapping[str, Sequence[float]],
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+) -> None:
+    """Adds named sites; points are in the body frame, or in the world at the zero pose when `pose` is given.
+
+    With `pose` the site's axes are the world's at the zero pose.
+    """
+    for name, point in points.items():
+        quat = np.array([1.0, 0.0, 0.0, 0.0])
+        position = np.asarray(point, dtype=float)
+        if pose is not None:
+            position = pose[1].T @ (position - pose[0])
+            mujoco.mju_mat2Quat(quat, pose[1].T.flatten())
+        body.add_site(name=name, pos=position, quat=quat, size=[0.004, 0.0, 0.0], group=4)

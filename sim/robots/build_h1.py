@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sim.robots.build_common import HAND_FRICTION, ROBOT_AFFINITY, ROBOT_BIT, add_servo, tune_joint
+from sim.robots.build_common import HAND_FRICTION, ROBOT_AFFINITY, ROBOT_BIT, add_landmarks, add_servo, tune_joint
 from sim.robots.csv_tree import LinkRow, add_link, read_rows
 
 __all__ = ["build_h1", "reduce_mesh"]
@@ -199,6 +199,9 @@ def build_h1(menagerie: Path, table: Path, target: Path) -> None:
         xyaxes=[0.0, -1.0, 0.0, np.sin(pitch), 0.0, np.cos(pitch)],
         fovy=72.0,
     )
+    add_landmarks(spec.body("torso_link"), {"chest": [0.0, 0.0, 0.3], "head": [0.03, 0.0, 0.69]})
+    for side in ("left", "right"):  # centre of the sole, under the foot's capsules
+        add_landmarks(spec.body(f"{side}_ankle_link"), {f"{side}_sole": [0.0525, 0.0, -0.07]})
     spec.compile()
     text = spec.to_xml()
     (target / "h1.xml").write_text(text, encoding="utf-8")

@@ -15,6 +15,7 @@ from sim.robots.build_common import (
     HAND_FRICTION,
     ROBOT_AFFINITY,
     ROBOT_BIT,
+    add_landmarks,
     add_servo,
     shell,
     shell_box,
@@ -148,6 +149,10 @@ def build_x1(table: Path, target: Path) -> None:
         xyaxes=[*(rotation.T @ right), *(rotation.T @ up)],
         fovy=72.0,
     )
+    add_landmarks(bodies[trunk], {"chest": [0.0, 0.0, 0.98], "head": [0.03, 0.0, 1.185]}, pose[trunk])
+    for side in ("left", "right"):
+        link = f"link_{side}_ankle_roll"
+        add_landmarks(bodies[link], {f"{side}_sole": [0.035, float(at[link][1]), 0.0]}, pose[link])
     spec.compile()
     target.mkdir(parents=True, exist_ok=True)
     (target / "x1.xml").write_text(spec.to_xml(), encoding="utf-8")

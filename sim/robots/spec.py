@@ -1,0 +1,165 @@
+"""What the project knows of a robot beyond its MJCF: which joints are arms, legs and hands, where the key bodies are, its limits.
+
+A robot is one YAML file (`specs/<name>.yaml`) and one MJCF; `load_robot` validates the file against the MJCF.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import yaml
+
+from configs.validate import ConfigError, build
+
+__all__ = ["KEY_BODIES", "SIDES", "ArmSpec", "FootSpec", "RobotSpec", "available_robots", "load_robot"]
+
+SIDES = ("left", "right")
+#: Bodies whose positions make up a motion frame, in this order, shared by all robots (and matched to SMPL joints in `data`).
+KEY_BODIES = (
+    "torso",
+    "head",
+    "left_shoulder",
+    "left_elbow",
+    "left_hand",
+    "right_shoulder",
+    "right_elbow",
+    "right_hand",
+    "left_hip",
+    "left_knee",
+    "left_ankle",
+    "right_hip",
+    "right_knee",
+    "right_ankle",
+)
+_SPECS = Path(__file__).parent / "specs"
+
+
+@dataclass(frozen=True, slots=True)
+class ArmSpec:
+    """One arm with its hand.
+
+    Attributes:
+        joints: arm joints from shoulder to wrist.
+        grasp_site: MJCF site at the centre of the grasp, x along the fingers, y the closing direction.
+        hand_joints: actuated hand joints.
+        hand_open: their positions when open (rad or m).
+        hand_closed: their positions when closed.
+        finger_groups: two opposing groups of geom names; a grasp needs contact with both.
+        max_load_kg: heaviest object one arm carries.
+        carry: arm joint positions (rad) that hold an object in front of the body, out of the head camera's way.
+        rest: arm joint positions (rad) at rest.
+    """
+
+    joints: tuple[str, ...]
+    grasp_site: str
+    hand_joints: tuple[str, ...]
+    hand_open: tuple[float, ...]
+    hand_closed: tuple[float, ...]
+    finger_groups: tuple[tuple[str, ...], tuple[str, ...]]
+    max_load_kg: float
+    rest: tuple[float, ...]
+    carry: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FootSpec:
+    """Rectangular sole around the sites `left_sole` and `right_sole`, half extents in metres."""
+
+    half_length_m: float
+    half_width_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class RobotSpec:
+    """A dual-arm humanoid.
+
+    Attributes:
+        name: robot name as used in commands.
+        mjcf: path of the MJCF file, relative to the YAML file.
+        mjcf_path: absolute path of the MJCF file.
+        root_body: pelvis body, carrying the free joint.
+        leg_joints, waist_joints: joint names.
+        arms: `left` and `right`.
+        key_bodies: MJCF body or site for each of `KEY_BODIES`.
+        head_camera: MJCF camera name.
+        standing_pelvis_height_m: pelvis above the floor when standing.
+        pelvis_height_range_m: lowest and highest pelvis with flat soles and a balanced centre of mass.
+        foot: sole size.
+        footprint_radius_m: radius of the disc that navigation keeps free.
+        two_arm_max_load_kg: heaviest object both arms carry.
+        max_joint_velocity: rad/s for trajectories and inverse kinematics.
+        joints: every scalar joint of the MJCF in its order (read from the file).
+    """
+
+    name: str
+    mjcf: str
+    root_body: str
+    leg_joints: tuple[str, ...]
+    waist_joints: tuple[str, ...]
+    arms: Mapping[str, ArmSpec]
+    key_bodies: Mapping[str, str]
+    head_camera: str
+    standing_pelvis_height_m: float
+    pelvis_height_range_m: tuple[float, float]
+    foot: FootSpec
+    footprint_radius_m: float
+    two_arm_max_load_kg: float
+    max_joint_velocity: float
+    mjcf_path: Path = field(default=Path())
+    joints: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if tuple(sorted(self.arms)) != SIDES:
+            raise ValueError(f"arms {sorted(self.arms)} must be left and right")
+        missing = [name for name in KEY_BODIES if name not in self.key_bodies]
+        if missing:
+            raise ValueError(f"key bodies {missing} are missing; needed: {', '.join(KEY_BODIES)}")
+        low, high = self.pelvis_height_range_m
+        if not 0.0 < low < high:
+            raise ValueError(f"pelvis height range {self.pelvis_height_range_m} is empty")
+
+
+def available_robots() -> tuple[str, ...]:
+    """Names of the built-in robots."""
+    return tuple(sorted(path.stem for path in _SPECS.glob("*.yaml")))
+
+
+@lru_cache(maxsize=16)
+def load_robot(name: str) -> RobotSpec:
+    """Loads a robot by name, or from the path of a YAML file of the same format.
+
+    Raises:
+        ConfigError: on an unknown name, a bad file, or a joint that the MJCF does not have.
+    """
+    path = Path(name) if name.endswith((".yaml", ".yml")) else _SPECS / f"{name}.yaml"
+    if not path.is_file():
+        raise ConfigError(f"robot {name!r}: no such robot; allowed: {', '.join(available_robots())}, or a path to a YAML file")
+    values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: expected a mapping")
+    mjcf_path = (path.parent / str(values.get("mjcf", ""))).resolve()
+    if not mjcf_path.is_file():
+        raise ConfigError(f"{path}: mjcf {values.get('mjcf')!r} not found")
+    joints = _scalar_joints(mjcf_path)
+    spec = build(RobotSpec, {**values, "mjcf_path": mjcf_path, "joints": joints}, where=str(path.name))
+    named = [*spec.leg_joints, *spec.waist_joints]
+    for arm in spec.arms.values():
+        named += [*arm.joints, *arm.hand_joints]
+        sizes = {len(arm.joints), len(arm.rest), len(arm.carry)}, {len(arm.hand_joints), len(arm.hand_open), len(arm.hand_closed)}
+        if any(len(size) != 1 for size in sizes):
+            raise ConfigError(f"{path}: rest, carry, hand_open and hand_closed need one value per joint of {arm.grasp_site}")
+    unknown = [joint for joint in named if joint not in joints]
+    if unknown:
+        raise ConfigError(f"{path}: joints {unknown} are not in {mjcf_path.name}; it has: {', '.join(joints)}")
+    return spec
+
+
+def _scalar_joints(mjcf_path: Path) -> tuple[str, ...]:
+    world = ElementTree.parse(mjcf_path).getroot().find("worldbody")
+    if world is None:
+        raise ConfigError(f"{mjcf_path}: no worldbody")
+    return tuple(joint.get("name", "") for joint in world.iter("joint") if joint.get("type") not in ("free", "ball"))
