@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal
 
 import yaml
 
@@ -92,6 +93,7 @@ class RobotSpec:
         footprint_radius_m: radius of the disc that navigation keeps free.
         two_arm_max_load_kg: heaviest object both arms carry.
         max_joint_velocity: rad/s for trajectories and inverse kinematics.
+        solver: inverse kinematics of waist and both arms together, or of each arm alone.
         joints: every scalar joint of the MJCF in its order (read from the file).
     """
 
@@ -109,6 +111,7 @@ class RobotSpec:
     footprint_radius_m: float
     two_arm_max_load_kg: float
     max_joint_velocity: float
+    solver: Literal["whole_body", "per_arm"]
     mjcf_path: Path = field(default=Path())
     joints: tuple[str, ...] = ()
 

@@ -1,0 +1,158 @@
+"""Differential inverse kinematics on pin-pink, iterated to convergence, shared by the two arm solvers.
+
+Each iteration solves Pink's quadratic program: minimise the weighted task errors subject to joint position and velocity limits,
+    min_v  sum_i || J_i v dt + alpha e_i ||^2_{W_i} + lambda || v ||^2    s.t.  q_min <= q + v dt <= q_max,  |v| <= v_max
+with frame tasks for the grasp sites, a posture task that keeps redundant joints near their start, and, for whole-body solves, a
+centre-of-mass task. Legs and lean are those of the crouch at the given pelvis height.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pink
+import pinocchio as pin
+from numpy.typing import NDArray
+from pink.limits import ConfigurationLimit, VelocityLimit
+from pink.tasks import ComTask, FrameTask, PostureTask
+
+from sim.robots.crouch_table import CrouchTable
+from sim.robots.kinematics import RobotModel, root_quaternion
+from sim.robots.solver import IkResult, ReachTarget
+
+__all__ = ["PinkCore"]
+
+Array = NDArray[np.float64]
+_DT_S = 0.1
+_MAX_ITERATIONS = 40
+_STALL_M = 2e-5
+
+
+class PinkCore:
+    """Solves for the grasp sites of the given arms with the given movable joints."""
+
+    def __init__(self, robot: RobotModel, crouches: CrouchTable, movable: Sequence[str], balance: bool) -> None:
+        self.robot = robot
+        self._crouches = crouches
+        self._movable = robot.indices(tuple(movable))
+        self._balance = balance
+        model = robot.model
+        locked = [model.getJointId(name) for name in model.names[2:] if name not in set(movable)]
+        self._full_names = list(movable)
+        self._locked = locked
+        self._reduced: dict[int, tuple[pin.Model, pin.Data, NDArray[np.int64]]] = {}
+
+    def _model_at(self, pelvis_height_m: float) -> tuple[pin.Model, pin.Data, NDArray[np.int64], float]:
+        """Reduced model with the root and all other joints locked at the crouch; cached per centimetre."""
+        crouch = self._crouches.at(pelvis_height_m)
+        key = round(pelvis_height_m * 1000)
+        if key not in self._reduced:
+            root = np.array([0.0, 0.0, 0.0, *root_quaternion(0.0, crouch.pelvis_pitch_rad)])
+            reference = self.robot.configuration(root, crouch.q)
+            root_id = 1
+            reduced = pin.buildReducedModel(self.robot.model, [root_id, *self._locked], reference)
+            reduced.velocityLimit = np.full(reduced.nv, self.robot.spec.max_joint_velocity * 4.0)
+            order = np.array([reduced.joints[reduced.getJointId(name)].idx_q for name in self._full_names])
+            if len(self._reduced) > 256:
+                self._reduced.clear()
+            self._reduced[key] = (reduced, reduced.createData(), order)
+        model, data, order = self._reduced[key]
+        return model, data, order, crouch.pelvis_pitch_rad
+
+    def solve(
+        self,
+        targets: Mapping[str, ReachTarget],
+        q: Array,
+        dq: Array | None,
+        pelvis_height_m: float,
+        tolerance_m: float,
+        restarts: int,
+    ) -> IkResult:
+        """See `ArmSolver.solve`."""
+        unknown = sorted(set(targets) - set(self.robot.spec.arms))
+        if unknown or not targets:
+            raise ValueError(f"targets for arms {unknown or 'none'}; allowed: left, right")
+        model, data, order, _ = self._model_at(pelvis_height_m)
+        q = np.asarray(q, dtype=float)
+        lower, upper = self.robot.lower[self._movable], self.robot.upper[self._movable]
+        warm = np.clip(q[self._movable], lower + 1e-4, upper - 1e-4)
+        if dq is not None:  # start where the arm will be after one control period
+            warm = np.clip(warm + 0.02 * np.asarray(dq)[self._movable], lower + 1e-4, upper - 1e-4)
+        rng = np.random.default_rng(0)
+        best: tuple[float, float, float, Array] | None = None
+        iterations = 0
+        for attempt in range(restarts + 1):
+            start = warm if attempt == 0 else self._restart(warm, lower, upper, rng, attempt)
+            found, used = self._descend(model, data, order, targets, start, tolerance_m)
+            iterations += used
+            error, angle, posture = found
+            cost = max(error, 0.0) + 0.002 * angle
+            if best is None or (error <= tolerance_m, -cost) > (best[0] <= tolerance_m, -best[2]):
+                best = (error, angle, cost, posture)
+            if best[0] <= tolerance_m and (best[1] < 0.9 or attempt >= 1):
+                break
+        if best is None:
+            raise AssertionError("at least one attempt is made")
+        out = self._crouches.apply(q, pelvis_height_m)
+        out[self._movable] = best[3]
+        margin = self._crouches.balance_margin(out, pelvis_height_m)
+        return IkResult(out, best[0] <= tolerance_m and margin > 0.0, best[0], best[1], margin, iterations)
+
+    def _restart(self, warm: Array, lower: Array, upper: Array, rng: np.random.Generator, attempt: int) -> Array:
+        if attempt == 1:
+            base = self.robot.arm_posture(self.robot.posture(), "carry")[self._movable]
+            return np.clip(base, lower + 1e-3, upper - 1e-3)
+        centre = np.clip(0.5 * (lower + upper), warm - 1.5, warm + 1.5)
+        return np.clip(centre + rng.uniform(-0.8, 0.8, len(warm)), lower + 1e-3, upper - 1e-3)
+
+    def _descend(
+        self,
+        model: pin.Model,
+        data: pin.Data,
+        order: NDArray[np.int64],
+        targets: Mapping[str, ReachTarget],
+        start: Array,
+        tolerance_m: float,
+    ) -> tuple[tuple[float, float, Array], int]:
+        full = pin.neutral(model)
+        full[order] = start
+        configuration = pink.Configuration(model, data, full, copy_data=False)
+        tasks: list[FrameTask | PostureTask | ComTask] = []
+        frame_tasks: list[tuple[FrameTask, ReachTarget]] = []
+        for arm, target in targets.items():
+            pointing = target.pointing_weight if target.rotation is not None else 0.0
+            roll = target.roll_weight if target.rotation is not None else 0.0
+            task = FrameTask(
+                self.robot.spec.arms[arm].grasp_site,
+                position_cost=1.0,
+                orientation_cost=[roll * 0.3 + 1e-6, pointing * 0.3 + 1e-6, pointing * 0.3 + 1e-6],
+                lm_damping=1e-4,
+            )
+            rotation = np.eye(3) if target.rotation is None else target.rotation
+            task.set_target(pin.SE3(np.asarray(rotation, dtype=float), np.asarray(target.position, dtype=float)))
+            tasks.append(task)
+            frame_tasks.append((task, target))
+        posture = PostureTask(cost=3e-3)
+        posture.set_target(full)
+        tasks.append(posture)
+        if self._balance:
+            com = ComTask(cost=0.05)
+            com.set_target_from_configuration(configuration)
+            tasks.append(com)
+        limits = [ConfigurationLimit(model), VelocityLimit(model)]
+        previous, error = np.inf, np.inf
+        step = 0
+        for step in range(1, _MAX_ITERATIONS + 1):
+            velocity = pink.solve_ik(configuration, tasks, _DT_S, solver="daqp", damping=1e-8, limits=limits, safety_break=False)
+            configuration.integrate_inplace(velocity, _DT_S)
+            error = max(float(np.linalg.norm(task.compute_error(configuration)[:3])) for task, _ in frame_tasks)
+            if error < 0.1 * tolerance_m or abs(previous - error) < _STALL_M:
+                break
+            previous = error
+        angle = 0.0
+        for task, target in frame_tasks:
+            if target.rotation is not None and target.pointing_weight > 0.0:
+                reached = configuration.get_transform_frame_to_world(task.frame).rotation[:, 0]
+                angle = max(angle, float(np.arccos(np.clip(reached @ np.asarray(target.rotation)[:, 0], -1.0, 1.0))))
+        return (error, angle, np.asarray(configuration.q)[order].copy()), step
