@@ -83,6 +83,7 @@ class CrossSpatialEncoder(nn.Module):
 
     def forward(self, features: Tensor, geo: GeoFeatures, h: int, w: int, camera_in_pelvis: Tensor | None = None) -> Tensor:
         """T (I, N, D) from F2D (I, N, D)."""
-        spatial = self.spatial(geo, h, w, camera_in_pelvis).to(features.dtype)
-        out = self.mlp(features + self.phi(spatial))
+        own = self.phi.weight.dtype  # stays in float32 under a backbone in half precision
+        spatial = self.spatial(geo, h, w, camera_in_pelvis).to(own)
+        out = self.mlp(features.to(own) + self.phi(spatial)).to(features.dtype)
         return out if self.cfg.literal else features + out

@@ -5,15 +5,17 @@ For a visual token at (x, y) in an image in which the robot stands at (x_r, y_r)
     [t, sign(y - y_r), sign(x - x_r)].
 
 The paper leaves open the offset between text and image, what is compared, and whether "added to visual tokens" means a learned
-embedding. Fixed here: positions are compared in cells of the merged grid (a token in the robot's own row or column has sign 0),
-and ids are offset as M-RoPE's are. With s the first free position, c and r the robot's column and row:
+embedding. Fixed here: a token's place is its centre on the merged grid; within a quarter of a cell of the robot's place it is
+level with it (sign 0), beyond that offsets dy and dx count cells, rounded away from zero. The band keeps the signs steady when
+the robot's place falls on the border between two cells, as it does for a robot that looks straight ahead. Ids are offset as
+M-RoPE's are. With s the first free position:
 
 | mode              | ids of the visual token in row i, column j      | next text position |
 |-------------------|-------------------------------------------------|--------------------|
 | `mrope`           | s + [0, i, j]                                   | s + max(h, w)      |
-| `rope_sign`       | s + [0, 1 + sign(i - r), 1 + sign(j - c)]       | s + 3              |
-| `rope_sign_raw`   | [s, sign(i - r), sign(j - c)]                   | s + 1              |
-| `rope_radial`     | s + [0, i - r, j - c]                           | s + max(h, w)      |
+| `rope_sign`       | s + [0, 1 + sign(dy), 1 + sign(dx)]             | s + 3              |
+| `rope_sign_raw`   | [s, sign(dy), sign(dx)]                         | s + 1              |
+| `rope_radial`     | s + [0, dy, dx]                                 | s + max(h, w)      |
 | `embed_sign`      | as `mrope`, and an embedding of the two signs   | s + max(h, w)      |
 | `rope_sign+embed` | as `rope_sign`, and the embedding               | s + 3              |
 
@@ -35,14 +37,16 @@ from torch import Tensor, nn
 
 from configs.schema.model import MpeMode
 
-__all__ = ["MPE_MODES", "SignEmbedding", "position_ids", "relative_cells", "visual_positions"]
+__all__ = ["MPE_MODES", "SignEmbedding", "degenerate", "position_ids", "relative_cells", "visual_positions"]
 
 MPE_MODES: tuple[MpeMode, ...] = ("mrope", "rope_sign", "rope_sign_raw", "rope_radial", "embed_sign", "rope_sign+embed")
 Centroid = tuple[float, float]
+#: Share of a cell within which a token is level with the robot.
+LEVEL = 0.25
 
 
 def relative_cells(h: int, w: int, centroid: Centroid) -> Tensor:
-    """Rows and columns of the tokens relative to the robot's cell, (2, N) long, raster order.
+    """Rows and columns of the tokens relative to the robot (dy, dx), (2, N) long, raster order.
 
     Args:
         h: rows of the merged grid.
@@ -53,11 +57,21 @@ def relative_cells(h: int, w: int, centroid: Centroid) -> Tensor:
     x, y = centroid
     if not (math.isfinite(x) and math.isfinite(y)):
         raise ValueError(f"centroid must be finite, got {centroid}")
-    row = min(max(math.floor(y * h), -h), 2 * h)
-    col = min(max(math.floor(x * w), -w), 2 * w)
-    rows = torch.arange(h).repeat_interleave(w) - row  # (N,)
-    cols = torch.arange(w).repeat(h) - col  # (N,)
+    rows = _offsets(h, y).repeat_interleave(w)  # (N,)
+    cols = _offsets(w, x).repeat(h)  # (N,)
     return torch.stack([rows, cols])
+
+
+def _offsets(cells: int, place: float) -> Tensor:
+    """Signed offsets of a line of cells from a place given as a fraction of the line."""
+    delta = torch.arange(cells, dtype=torch.float64) + 0.5 - min(max(place, -1.0), 2.0) * cells
+    return (delta.sign() * (delta.abs() - LEVEL).ceil().clamp_min(0)).long()
+
+
+def degenerate(h: int, w: int, centroid: Centroid) -> tuple[bool, bool]:
+    """Whether the vertical and the horizontal sign is the same for all tokens, so that it tells them nothing apart."""
+    signs = relative_cells(h, w, centroid).sign()
+    return bool((signs[0] == signs[0, 0]).all()), bool((signs[1] == signs[1, 0]).all())
 
 
 def visual_positions(mode: MpeMode, start: int, h: int, w: int, centroid: Centroid | None) -> tuple[Tensor, int]:

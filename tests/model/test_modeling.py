@@ -5,7 +5,8 @@ import torch
 from peft import PeftModel
 
 from proprio_mllm.model.batch import Collator
-from proprio_mllm.model.building import build_model
+from proprio_mllm.model.building import add_adapter, build_model
+from proprio_mllm.model.groups import train_only
 
 
 def test_switches_off_give_the_base_model_exactly(cfg, build, examples, switch):
@@ -146,6 +147,18 @@ def test_text_only_batch_works(cfg, build, examples):
     out = model(collate([dataclasses.replace(examples[0], messages=tuple(messages), views=())]))
     assert out.visual is None
     assert out.loss.isfinite()
+
+
+def test_half_precision_backbone_trains_with_an_adapter(cfg, build, examples):
+    model, collate = build(dataclasses.replace(cfg, dtype="bfloat16"))
+    assert model.table.dtype is torch.bfloat16
+    add_adapter(model)
+    train_only(model, ["rows", "lora", "cse"])
+    model.core.activation_checkpointing_enable()
+    out = model.train()(collate(examples))
+    out.loss.backward()
+    assert out.loss.isfinite()
+    assert model.eval().generate(collate(_open(examples), generation=True), 2) is not None
 
 
 def test_cse_needs_a_point_map(cfg, processor):

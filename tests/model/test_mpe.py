@@ -4,7 +4,7 @@ import torch
 
 from data.records import Camera
 from proprio_mllm.model.geometry import KEY_BODIES, arm_length_m, body_point_in_pelvis, centroid, project, unproject
-from proprio_mllm.model.mpe import MPE_MODES, SignEmbedding, position_ids, relative_cells, visual_positions
+from proprio_mllm.model.mpe import MPE_MODES, SignEmbedding, degenerate, position_ids, relative_cells, visual_positions
 
 PAD = 9
 
@@ -58,12 +58,12 @@ def test_signs_through_the_projection_by_hand():
     # Reach point: 0.5 m ahead at height 1.2 / 14 = 0.0857 m; the camera is at 0.1857 m, so y = 50 + 50 * 0.1 / 0.5 = 60.
     place = centroid(_camera(1.2 / 14 + 0.1), _bodies(), "reach")
     assert place == pytest.approx((0.5, 0.6))
-    # 4 x 4 cells of 25 pixels: row floor(2.4) = 2, column floor(2.0) = 2.
+    # 4 x 4 cells of 25 pixels: the robot at row 2.4 (centres 0.5 1.5 2.5 3.5), column 2.0, on a border: no token is level.
     ids, after = visual_positions("rope_sign", 7, 4, 4, place)
     rows = [7, 7, 8, 9]
     assert ids[0].tolist() == [7] * 16
     assert ids[1].reshape(4, 4).tolist() == [[r] * 4 for r in rows]
-    assert ids[2].reshape(4, 4).tolist() == [[7, 7, 8, 9]] * 4
+    assert ids[2].reshape(4, 4).tolist() == [[7, 7, 9, 9]] * 4
     assert after == 10
 
 
@@ -79,7 +79,7 @@ def test_signs_through_the_projection_by_hand():
     ],
 )
 def test_golden_ids_of_every_mode(mode, height, width, after):
-    ids, following = visual_positions(mode, 5, 2, 2, (0.1, 0.9))  # robot in row 1, column 0
+    ids, following = visual_positions(mode, 5, 2, 2, (0.25, 0.75))  # robot in row 1, column 0
     assert ids[0].tolist() == [5] * 4
     assert ids[1].reshape(2, 2).tolist() == height
     assert ids[2].reshape(2, 2).tolist() == width
@@ -88,7 +88,7 @@ def test_golden_ids_of_every_mode(mode, height, width, after):
 
 def test_sequence_ids_with_two_images_and_text():
     tokens = [1, 2, PAD, PAD, PAD, PAD, 3, PAD, PAD, PAD, PAD, 4]
-    ids = position_ids(tokens, PAD, [(2, 2), (2, 2)], [(0.1, 0.9), None], "rope_sign")
+    ids = position_ids(tokens, PAD, [(2, 2), (2, 2)], [(0.25, 0.75), None], "rope_sign")
     assert ids[1].tolist() == [0, 1, 2, 2, 3, 3, 5, 6, 6, 7, 7, 8]  # the second image has no robot: as M-RoPE
     assert ids[0].tolist() == [0, 1, 2, 2, 2, 2, 5, 6, 6, 6, 6, 8]
 
@@ -111,6 +111,19 @@ def test_mismatched_images_are_refused(tokens, grids, message):
         position_ids(tokens, PAD, grids, [None] * len(grids), "mrope")
 
 
+def test_signs_are_steady_when_the_robot_looks_straight_ahead():
+    exact = relative_cells(4, 4, (0.5, 0.64))
+    for noise in (-1e-12, 1e-12):
+        assert torch.equal(relative_cells(4, 4, (0.5 + noise, 0.64)), exact)
+    assert exact[1].reshape(4, 4)[0].tolist() == [-2, -1, 1, 2]
+
+
+def test_degenerate_axes():
+    assert degenerate(4, 4, (0.5, 0.64)) == (False, False)
+    assert degenerate(4, 4, (0.5, 1.4)) == (True, False)
+    assert degenerate(4, 4, (-1.0, 2.0)) == (True, True)
+
+
 def test_far_and_infinite_centroids():
     cells = relative_cells(4, 4, (0.5, 500.0))
     assert cells[0].tolist() == [r - 8 for r in range(4) for _ in range(4)]
@@ -125,11 +138,11 @@ def test_unknown_mode_is_refused():
 
 def test_embedding_picks_the_sign_pair():
     embedding = SignEmbedding(3)
-    assert not embedding(2, 2, (0.1, 0.9)).any()
+    assert not embedding(2, 2, (0.25, 0.75)).any()
     with torch.no_grad():
         embedding.table.copy_(torch.arange(9.0)[:, None].expand(9, 3))
     # robot in row 1, column 0: signs (row, column) are (-, 0), (-, +), (0, 0), (0, +).
-    assert embedding(2, 2, (0.1, 0.9))[:, 0].tolist() == [1.0, 2.0, 4.0, 5.0]
+    assert embedding(2, 2, (0.25, 0.75))[:, 0].tolist() == [1.0, 2.0, 4.0, 5.0]
     assert not embedding(2, 2, None).any()
 
 
