@@ -1,0 +1,191 @@
+"""Frozen configuration of training: the loop's numbers per stage, and what each stage reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from configs.schema.model import ModelConfig
+
+__all__ = [
+    "AlignmentConfig",
+    "BaseConfig",
+    "CollectConfig",
+    "LoggerConfig",
+    "LoopConfig",
+    "SeluConfig",
+    "StageName",
+    "TrainConfig",
+    "Variant",
+]
+
+StageName = Literal["all", "data", "collect", "base", "pointmap", "tokenizer", "alignment", "selu"]
+Variant = Literal["full", "no_mpe", "no_cse", "no_mpe_cse"]
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """One run of the training loop.
+
+    Attributes:
+        steps: optimiser steps.
+        batch: examples per step and process.
+        lr: peak learning rate, reached after `warmup` steps, then a cosine down to a tenth of it.
+        warmup: steps of linear warm-up.
+        weight_decay: AdamW's, on matrices only.
+        clip: largest gradient norm.
+        checkpoint_every: steps between checkpoints.
+        log_every: steps between log lines.
+    """
+
+    steps: int
+    batch: int
+    lr: float
+    warmup: int = 50
+    weight_decay: float = 0.01
+    clip: float = 1.0
+    checkpoint_every: int = 200
+    log_every: int = 20
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "checkpoint_every", "log_every"):
+            _require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
+        _require(self.lr > 0.0, f"lr {self.lr} must be positive")
+
+
+@dataclass(frozen=True)
+class BaseConfig:
+    """`stage=base`: dense pretraining, then grounding, listing and planning together.
+
+    Attributes:
+        dense: loop of the dense, name-tied pretraining of the vision tower.
+        joint: loop of the mixed batches.
+        questions: question and answer pairs packed per image.
+        plan_share: share of the joint batches that are planning demonstrations.
+        dense_weight: weight of the dense loss on the joint batches' views.
+    """
+
+    dense: LoopConfig
+    joint: LoopConfig
+    questions: int = 8
+    plan_share: float = 0.6
+    dense_weight: float = 0.5
+
+    def __post_init__(self) -> None:
+        _require(0.0 <= self.plan_share <= 1.0, f"plan_share {self.plan_share} outside [0, 1]")
+        _require(self.questions > 0, f"questions {self.questions} must be positive")
+
+
+@dataclass(frozen=True)
+class AlignmentConfig:
+    """`stage=alignment`: two frozen phases, then the joint one.
+
+    Attributes:
+        text: loop of phase 2a-i, motion and text; vision and CSE frozen.
+        image: loop of phase 2a-ii, motion and image; the language model's LoRA frozen.
+        joint: loop of phase 2b; rows, LoRA, CSE and merger train.
+        plan_share: share of the joint batches that are planning demonstrations with proprioception.
+        questions: body-relative questions packed per image.
+        mask: share of motion tokens hidden in masked motion.
+    """
+
+    text: LoopConfig
+    image: LoopConfig
+    joint: LoopConfig
+    plan_share: float = 0.7
+    questions: int = 6
+    mask: float = 0.3
+
+
+@dataclass(frozen=True)
+class SeluConfig:
+    """`stage=selu`: rounds of rollouts, critic and actor fine-tuning.
+
+    Attributes:
+        rounds: number of rounds.
+        episodes: rollouts per round.
+        temperature: of the actor while exploring.
+        critic: loop of the critic's fine-tuning.
+        actor: loop of the actor's fine-tuning.
+        truth: `audit` only reports the critic against the simulator; `oracle` lets the simulator judge (a labelled ablation).
+        replay_share: share of the actor's batches that are planning demonstrations, against forgetting.
+        per_class: most kept trajectories per verb, robot and category.
+    """
+
+    critic: LoopConfig
+    actor: LoopConfig
+    rounds: int = 2
+    episodes: int = 60
+    temperature: float = 0.7
+    truth: Literal["audit", "oracle"] = "audit"
+    replay_share: float = 0.5
+    per_class: int = 40
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """What the simulator writes for training.
+
+    Attributes:
+        views: posed views.
+        episodes: expert episodes.
+        clips: generated motion clips before filtering.
+        workers: processes.
+    """
+
+    views: int = 6000
+    episodes: int = 500
+    clips: int = 300
+    workers: int = 2
+
+
+@dataclass(frozen=True)
+class LoggerConfig:
+    """Where metrics go besides the CSV file and the terminal.
+
+    Attributes:
+        wandb: `offline` writes a local W&B run, `online` sends it to your account, `disabled` leaves W&B out.
+        project: W&B project.
+    """
+
+    wandb: Literal["offline", "online", "disabled"] = "offline"
+    project: str = "proprio-mllm"
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything `train.py` needs.
+
+    Attributes:
+        stage: what to run.
+        variant: which ablation of the model.
+        model: the model.
+        output: folder of all outputs.
+        seed: seed of data order, initial weights and rollouts.
+        threads: torch threads; 0 leaves torch's choice.
+        overwrite: run a stage again although its output is current.
+        release: folder the finished stages are exported to, None for no export.
+        data: where motions come from.
+    """
+
+    stage: StageName
+    variant: Variant
+    model: ModelConfig
+    base: BaseConfig
+    pointmap: LoopConfig
+    tokenizer: LoopConfig
+    alignment: AlignmentConfig
+    selu: SeluConfig
+    collect: CollectConfig = field(default_factory=CollectConfig)
+    logger: LoggerConfig = field(default_factory=LoggerConfig)
+    output: str = "outputs"
+    seed: int = 0
+    threads: int = 2
+    overwrite: bool = False
+    release: str | None = None
+    resume: bool = True

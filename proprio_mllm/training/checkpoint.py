@@ -1,0 +1,82 @@
+"""Checkpoints of a running loop: safetensors and JSON, renamed into place, so that a kill leaves the last complete one.
+
+Batches depend on (seed, step) alone, so weights, optimiser state and the step number are the whole state of a run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+__all__ = ["load_checkpoint", "save_checkpoint"]
+
+
+def save_checkpoint(folder: Path, step: int, module: nn.Module, optimizer: torch.optim.Optimizer, key: str) -> None:
+    """Writes a checkpoint atomically.
+
+    Args:
+        folder: replaced as a whole.
+        step: steps taken.
+        module: its trainable parameters and all buffers are stored.
+        optimizer: AdamW over those parameters.
+        key: identifies the run; loading with another key is refused.
+    """
+    work = folder.with_name(folder.name + ".tmp")
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    save_file(_trained(module), work / "model.safetensors")
+    state = optimizer.state_dict()["state"]
+    flat = {f"{index}.{name}": torch.as_tensor(value).contiguous() for index, entry in state.items() for name, value in entry.items()}
+    save_file(flat, work / "optimizer.safetensors")
+    (work / "state.json").write_text(json.dumps({"step": step, "key": key}), encoding="utf-8")
+    old = folder.with_name(folder.name + ".old")
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        os.replace(folder, old)
+    os.replace(work, folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def load_checkpoint(folder: Path, module: nn.Module, optimizer: torch.optim.Optimizer, key: str) -> int:
+    """Restores a checkpoint and returns its step; 0 when there is none, or it belongs to another run."""
+    if not (folder / "state.json").is_file():
+        folder = folder.with_name(folder.name + ".old")
+    if not (folder / "state.json").is_file():
+        return 0
+    state: dict[str, Any] = json.loads((folder / "state.json").read_text(encoding="utf-8"))
+    if state["key"] != key:
+        return 0
+    tensors = load_file(folder / "model.safetensors")
+    own = _trained(module)
+    if set(own) != set(tensors):
+        raise ValueError(f"{folder}: checkpoint holds other tensors than the model: {sorted(set(own) ^ set(tensors))[:4]}")
+    with torch.no_grad():
+        for name, tensor in own.items():
+            tensor.copy_(tensors[name])
+    entries: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in load_file(folder / "optimizer.safetensors").items():
+        index, _, field = name.partition(".")
+        entries.setdefault(int(index), {})[field] = tensor
+    optimizer.load_state_dict({"state": entries, "param_groups": optimizer.state_dict()["param_groups"]})
+    return int(state["step"])
+
+
+def _trained(module: nn.Module) -> dict[str, Tensor]:
+    tensors: dict[str, Tensor] = {}
+    seen: set[int] = set()
+    for name, parameter in module.named_parameters():
+        if parameter.requires_grad and id(parameter) not in seen:
+            seen.add(id(parameter))
+            tensors[name] = parameter.data
+    for name, buffer in module.named_buffers():
+        if id(buffer) not in seen:
+            seen.add(id(buffer))
+            tensors[name] = buffer
+    return {name: tensor.contiguous() if not tensor.is_contiguous() else tensor for name, tensor in tensors.items()}

@@ -1,0 +1,208 @@
+"""Shards as training examples: decoding, held-out splits, and the questions an image can be asked.
+
+Views and steps are decoded on demand; motion windows, which are small, are kept in memory. The held-out part of each shard is
+fixed by the row's seed or episode, so it is the same for every stage and variant.
+
+Shape letters: T frames, F motion features, K key bodies, H and W image rows and columns.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from configs.schema.model import ModelConfig
+from data.motion import KEY_BODY_COUNT
+from data.records import Camera, HistoryItem
+from data.shards import ShardReader, decode_depth, decode_motion, decode_png, decode_segmentation
+from proprio_mllm.model.batch import Example, View
+from proprio_mllm.model.geometry import unproject
+from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.model.prompts import answers, looking, plan_prompt, with_answer
+from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
+
+__all__ = ["Clips", "Demos", "Views", "held_out", "shard_hash"]
+
+#: One in this many views, episodes and clips is never trained on.
+HELD_OUT = 20
+GROUNDING = ("side", "distance", "height")
+BODY_RELATIVE = ("arm", "shift")
+
+
+def held_out(key: str) -> bool:
+    """Whether a row with this key belongs to the held-out part."""
+    return int.from_bytes(hashlib.sha256(key.encode()).digest()[:4], "big") % HELD_OUT == 0
+
+
+def shard_hash(folder: Path) -> str:
+    """Hash of a shard folder's manifest, which names the checksums of all its parts."""
+    return hashlib.sha256((Path(folder) / "manifest.json").read_bytes()).hexdigest()[:16]
+
+
+def _camera(row: Mapping[str, Any], pose: Sequence[float]) -> Camera:
+    return Camera(
+        np.asarray(row["intrinsics"], dtype=np.float64).reshape(3, 3),
+        np.asarray(pose, dtype=np.float64).reshape(4, 4),
+        int(row["height"]),
+        int(row["width"]),
+    )
+
+
+def key_bodies_of(motion: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Key bodies (K, 3) of the newest frame of a motion (T, F)."""
+    return motion[-1, : 3 * KEY_BODY_COUNT].reshape(KEY_BODY_COUNT, 3).astype(np.float64)
+
+
+class _Split:
+    """Indices of the training and held-out rows of a reader."""
+
+    def __init__(self, keys: Sequence[str], folder: Path) -> None:
+        mask = np.array([held_out(key) for key in keys], dtype=bool)
+        self.train = np.flatnonzero(~mask)
+        self.test = np.flatnonzero(mask)
+        if not len(self.train):
+            raise ValueError(f"{folder}: no training rows among {len(keys)}")
+
+
+@dataclass(frozen=True, slots=True)
+class ViewRow:
+    """One posed view with its truth: `objects` as written by the simulator, `points_m` (H, W, 3) in the camera frame."""
+
+    view: View
+    motion: NDArray[np.float32]
+    objects: tuple[Mapping[str, Any], ...]
+    segmentation: NDArray[np.int16]
+    points_m: NDArray[np.float32]
+
+
+class Views:
+    """Posed views with depth and segmentation."""
+
+    def __init__(self, folder: Path, cfg: ModelConfig) -> None:
+        self.reader = ShardReader(folder, "views")
+        self.split = _Split([f"{s}" for s in self.reader.column("seed")], folder)
+        self.type_names: tuple[str, ...] = tuple(json.loads(self.reader.manifest.metadata["type_names"])) if isinstance(
+            self.reader.manifest.metadata["type_names"], str
+        ) else tuple(self.reader.manifest.metadata["type_names"])
+        self._cfg = cfg
+
+    def row(self, index: int) -> ViewRow:
+        """Decodes one row."""
+        row = self.reader[int(index)]
+        height, width = int(row["height"]), int(row["width"])
+        motion = decode_motion(row["motion"])
+        camera = _camera(row, row["camera_in_pelvis"])
+        points = unproject(decode_depth(row["depth"], height, width), camera.intrinsics)
+        oracle = points if self._cfg.point_map.encoder == "oracle" else None
+        view = View(decode_png(row["image"]), camera, key_bodies_of(motion), oracle)
+        objects = tuple(json.loads(row["objects"]))
+        return ViewRow(view, motion, objects, decode_segmentation(row["segmentation"], height, width), points)
+
+    def pairs(self, row: ViewRow, kinds: Sequence[str], count: int, rng: np.random.Generator) -> list[tuple[str, str]]:
+        """Question and answer pairs about visible objects, at most `count`, drawn without repetition."""
+        bodies = row.view.key_bodies
+        assert bodies is not None
+        found: list[tuple[str, str]] = []
+        visible = [thing for thing in row.objects if int(thing["pixels"]) >= 6]
+        for thing in visible:
+            centre = np.asarray(thing["center_in_pelvis"], dtype=np.float64)
+            for kind in kinds:
+                answer = {
+                    "side": lambda c=centre: side_answer(c),
+                    "distance": lambda c=centre: distance_answer(c),
+                    "height": lambda c=centre: height_answer(c),
+                    "arm": lambda c=centre: arm_answer(c),
+                    "shift": lambda c=centre: shift_answer(c, bodies),
+                }[kind]()
+                found.append((ask(kind, str(thing["id"])), answer))
+        order = rng.permutation(len(found))[:count]
+        return [found[i] for i in order]
+
+    def listing(self, row: ViewRow) -> tuple[str, str]:
+        """Image to text: the names of the objects in view, nearest to the top-left corner first."""
+        visible = [thing for thing in row.objects if int(thing["pixels"]) >= 6]
+        ordered = sorted(visible, key=lambda thing: (float(thing["bbox"][0]), float(thing["bbox"][1])))
+        return "see?", answers([str(thing["id"]) for thing in ordered][:8])
+
+
+class Demos:
+    """Expert steps: the planner's prompt and the step that the expert chose."""
+
+    def __init__(self, folder: Path, cfg: ModelConfig) -> None:
+        self.reader = ShardReader(folder, "demos")
+        self.split = _Split(self.reader.column("episode"), folder)
+        self.motions = np.stack([decode_motion(m) for m in self.reader.column("motion")])  # (N, T, F)
+        self._cfg = cfg
+
+    def tokens(self, tokenizer: MotionTokenizer) -> NDArray[np.int64]:
+        """Motion tokens (N, T / stride) of every row's window."""
+        with torch.no_grad():
+            chunks = [tokenizer.encode(torch.from_numpy(self.motions[i : i + 256])) for i in range(0, len(self.motions), 256)]
+        return torch.cat(chunks).numpy()
+
+    def example(self, index: int, motion: Sequence[int] | None, answered: bool = True) -> Example:
+        """The step's conversation; `motion` None leaves proprioception out of the prompt."""
+        row = self.reader[int(index)]
+        prompt = plan_prompt(
+            row["instruction"],
+            row["robot"],
+            row["visible"],
+            row["known"],
+            [HistoryItem(item["step"], item["feedback"]) for item in row["history"]],
+            int(row["step"]),
+            int(row["step_budget"]),
+            motion,
+            self._cfg.prompt,
+            self._cfg.history,
+        )
+        bodies = np.asarray(row["key_bodies"], dtype=np.float64).reshape(KEY_BODY_COUNT, 3)
+        view = View(decode_png(row["image"]), _camera(row, row["camera_in_pelvis"]), bodies)
+        return Example(with_answer(prompt, row["target"]) if answered else prompt, (view,))
+
+    def target(self, index: int) -> str:
+        """The expert's step."""
+        return str(self.reader[int(index)]["target"])
+
+
+class Clips:
+    """Retargeted motions with captions and replayed head-camera frames."""
+
+    def __init__(self, folder: Path) -> None:
+        self.reader = ShardReader(folder, "clips")
+        self.split = _Split(self.reader.column("name"), folder)
+        self.motions = [decode_motion(m) for m in self.reader.column("motion")]
+        self.captions: list[list[str]] = self.reader.column("captions")
+
+    def window(self, index: int, frames: int, rng: np.random.Generator) -> NDArray[np.float32]:
+        """A window (frames, F) of a clip, at a random place; shorter clips repeat their first frame in front."""
+        motion = self.motions[int(index)]
+        start = int(rng.integers(0, max(len(motion) - frames, 0) + 1))
+        part = motion[start : start + frames]
+        return np.concatenate([np.repeat(part[:1], frames - len(part), axis=0), part])
+
+    def view(self, index: int, rng: np.random.Generator) -> tuple[View, NDArray[np.float32]]:
+        """A replayed frame and the motion up to it (at least one frame)."""
+        row = self.reader[int(index)]
+        pick = int(rng.integers(len(row["images"])))
+        frame = int(row["image_frames"][pick])
+        motion = self.motions[int(index)][: frame + 1]
+        camera = _camera(row, row["cameras_in_pelvis"][pick])
+        return View(decode_png(row["images"][pick]), camera, key_bodies_of(motion)), motion
+
+    def caption(self, index: int, rng: np.random.Generator) -> str:
+        """One of the clip's captions."""
+        return self.captions[int(index)][int(rng.integers(len(self.captions[int(index)])))]
+
+
+def question_example(views: Views, row: ViewRow, pairs: Sequence[tuple[str, str]], motion: Sequence[int] | None) -> Example:
+    """A packed conversation about one view."""
+    del views
+    return Example(looking(pairs, motion), (row.view,))
