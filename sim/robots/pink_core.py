@@ -27,6 +27,10 @@ Array = NDArray[np.float64]
 _DT_S = 0.1
 _MAX_ITERATIONS = 40
 _STALL_M = 2e-5
+_STALL_FRACTION = 4e-3
+#: Orientation weights are scaled by these in turn while the position is not reached: a hand may turn in order to reach.
+_RELAXATIONS = (1.0, 0.1, 0.0)
+_BANK_SIZE = 160
 
 
 class PinkCore:
@@ -42,6 +46,11 @@ class PinkCore:
         self._full_names = list(movable)
         self._locked = locked
         self._reduced: dict[int, tuple[pin.Model, pin.Data, NDArray[np.int64]]] = {}
+        low, high = robot.lower[self._movable], robot.upper[self._movable]
+        centre = robot.arm_posture(robot.posture(), "carry")[self._movable]
+        spread = np.random.default_rng(0).uniform(-1.6, 1.6, (_BANK_SIZE, len(low)))
+        self._bank: Array = np.clip(centre + spread, low + 1e-3, high - 1e-3)  # (B, movable) postures to restart from
+        self._owner = np.array([self._arm_of(name) for name in self._full_names])
 
     def _model_at(self, pelvis_height_m: float) -> tuple[pin.Model, pin.Data, NDArray[np.int64], float]:
         """Reduced model with the root and all other joints locked at the crouch; cached per centimetre."""
@@ -79,12 +88,14 @@ class PinkCore:
         warm = np.clip(q[self._movable], lower + 1e-4, upper - 1e-4)
         if dq is not None:  # start where the arm will be after one control period
             warm = np.clip(warm + 0.02 * np.asarray(dq)[self._movable], lower + 1e-4, upper - 1e-4)
-        rng = np.random.default_rng(0)
+        ranked: dict[str, NDArray[np.int64]] | None = None
         best: tuple[float, float, float, Array] | None = None
         iterations = 0
         for attempt in range(restarts + 1):
-            start = warm if attempt == 0 else self._restart(warm, lower, upper, rng, attempt)
-            found, used = self._descend(model, data, order, targets, start, tolerance_m)
+            if attempt >= 2 and ranked is None:
+                ranked = self._rank_bank(model, data, order, targets)
+            start = warm if attempt == 0 else self._restart(warm, lower, upper, ranked, attempt)
+            found, used = self._attempt(model, data, order, targets, start, tolerance_m, oriented_first=attempt == 0)
             iterations += used
             error, angle, posture = found
             cost = max(error, 0.0) + 0.002 * angle
@@ -99,12 +110,67 @@ class PinkCore:
         margin = self._crouches.balance_margin(out, pelvis_height_m)
         return IkResult(out, best[0] <= tolerance_m and margin > 0.0, best[0], best[1], margin, iterations)
 
-    def _restart(self, warm: Array, lower: Array, upper: Array, rng: np.random.Generator, attempt: int) -> Array:
-        if attempt == 1:
+    def _arm_of(self, joint: str) -> str:
+        return next((arm for arm, spec in self.robot.spec.arms.items() if joint in spec.joints), "")
+
+    def _rank_bank(
+        self, model: pin.Model, data: pin.Data, order: NDArray[np.int64], targets: Mapping[str, ReachTarget]
+    ) -> dict[str, NDArray[np.int64]]:
+        """Per targeted arm, the bank's postures from the nearest grasp site to the farthest."""
+        full = pin.neutral(model)
+        frames = {arm: model.getFrameId(self.robot.spec.arms[arm].grasp_site) for arm in targets}
+        distance = {arm: np.zeros(len(self._bank)) for arm in targets}
+        for row, posture in enumerate(self._bank):
+            full[order] = posture
+            pin.framesForwardKinematics(model, data, full)
+            for arm, target in targets.items():
+                pose = data.oMf[frames[arm]]
+                cost = float(np.linalg.norm(pose.translation - target.position))
+                if target.rotation is not None:
+                    cost += 0.1 * target.pointing_weight * (1.0 - float(pose.rotation[:, 0] @ target.rotation[:, 0]))
+                distance[arm][row] = cost
+        return {arm: np.argsort(values) for arm, values in distance.items()}
+
+    def _restart(self, warm: Array, lower: Array, upper: Array, ranked: dict[str, NDArray[np.int64]] | None, attempt: int) -> Array:
+        """First the carry posture, then for each targeted arm the nearest postures of the bank."""
+        if ranked is None:
             base = self.robot.arm_posture(self.robot.posture(), "carry")[self._movable]
             return np.clip(base, lower + 1e-3, upper - 1e-3)
-        centre = np.clip(0.5 * (lower + upper), warm - 1.5, warm + 1.5)
-        return np.clip(centre + rng.uniform(-0.8, 0.8, len(warm)), lower + 1e-3, upper - 1e-3)
+        start = warm.copy()
+        for arm, rows in ranked.items():
+            own = self._owner == arm
+            start[own] = self._bank[rows[attempt - 2], own]
+        return start
+
+    def _attempt(
+        self,
+        model: pin.Model,
+        data: pin.Data,
+        order: NDArray[np.int64],
+        targets: Mapping[str, ReachTarget],
+        start: Array,
+        tolerance_m: float,
+        *,
+        oriented_first: bool,
+    ) -> tuple[tuple[float, float, Array], int]:
+        """One start. Position goes before orientation: where both cannot be had, the hand turns as far as it must.
+
+        The warm start relaxes the orientation until the position is reached; a restart first finds the position, then the
+        best orientation that keeps it, so that a target out of reach is given up early.
+        """
+        oriented = any(target.rotation is not None for target in targets.values())
+        ladder = (1.0,) if not oriented else _RELAXATIONS if oriented_first else _RELAXATIONS[::-1]
+        found, iterations = self._descend(model, data, order, targets, start, tolerance_m, ladder[0])
+        for relaxation in ladder[1:]:
+            reached = found[0] <= tolerance_m
+            if reached == oriented_first:
+                break
+            following, used = self._descend(model, data, order, targets, found[2], tolerance_m, relaxation)
+            iterations += used
+            if not oriented_first and following[0] > tolerance_m:
+                break
+            found = following
+        return found, iterations
 
     def _descend(
         self,
@@ -114,6 +180,7 @@ class PinkCore:
         targets: Mapping[str, ReachTarget],
         start: Array,
         tolerance_m: float,
+        relaxation: float,
     ) -> tuple[tuple[float, float, Array], int]:
         full = pin.neutral(model)
         full[order] = start
@@ -121,8 +188,8 @@ class PinkCore:
         tasks: list[FrameTask | PostureTask | ComTask] = []
         frame_tasks: list[tuple[FrameTask, ReachTarget]] = []
         for arm, target in targets.items():
-            pointing = target.pointing_weight if target.rotation is not None else 0.0
-            roll = target.roll_weight if target.rotation is not None else 0.0
+            pointing = relaxation * target.pointing_weight if target.rotation is not None else 0.0
+            roll = relaxation * target.roll_weight if target.rotation is not None else 0.0
             task = FrameTask(
                 self.robot.spec.arms[arm].grasp_site,
                 position_cost=1.0,
@@ -147,7 +214,7 @@ class PinkCore:
             velocity = pink.solve_ik(configuration, tasks, _DT_S, solver="daqp", damping=1e-8, limits=limits, safety_break=False)
             configuration.integrate_inplace(velocity, _DT_S)
             error = max(float(np.linalg.norm(task.compute_error(configuration)[:3])) for task, _ in frame_tasks)
-            if error < 0.1 * tolerance_m or abs(previous - error) < _STALL_M:
+            if error < 0.1 * tolerance_m or abs(previous - error) < max(_STALL_M, _STALL_FRACTION * error):
                 break
             previous = error
         angle = 0.0
