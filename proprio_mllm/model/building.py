@@ -30,6 +30,7 @@ from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
 from configs.schema.model import ModelConfig
 from configs.validate import build
+from proprio_mllm.model.groups import adapter_of
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.point_map import OraclePointMap, SimPointMap
@@ -44,6 +45,7 @@ __all__ = [
     "build_processor",
     "load_model",
     "load_motion",
+    "merge_adapter",
     "save_model",
     "use_adapter",
 ]
@@ -162,14 +164,21 @@ def build_model(
         return ProprioMLLM(vlm, cfg, processor, motion_ids, point_map)
 
 
-def add_adapter(model: ProprioMLLM, name: str = "default") -> None:
+def add_adapter(model: ProprioMLLM, name: str = "default", start: str | None = None) -> None:
     """Adds LoRA weights and trainable motion rows under a name and makes them the active adapter.
 
     The first adapter freezes the whole backbone; choose what trains afterwards with `groups.train_only`.
 
+    Args:
+        model: the model.
+        name: name of the new adapter.
+        start: adapter whose weights the new one starts from; None starts as the backbone.
+
     Raises:
-        ValueError: when the name is taken.
+        ValueError: when the name is taken, or `start` does not exist.
     """
+    if start is not None:
+        use_adapter(model, start)
     tied = model.core.config.tie_word_embeddings
     rows: Any = list(model.motion_ids) if tied else {"embed_tokens": list(model.motion_ids), "lm_head": list(model.motion_ids)}
     lora = PeftLoraConfig(
@@ -190,6 +199,24 @@ def add_adapter(model: ProprioMLLM, name: str = "default") -> None:
             if key in heads:
                 parameter.requires_grad_(heads[key])
     use_adapter(model, name)
+    if start is not None:
+        parameters = dict(model.named_parameters())
+        with torch.no_grad():
+            for key, parameter in parameters.items():
+                if adapter_of(key) == name:
+                    parameter.copy_(parameters[f".{start}".join(key.rsplit(f".{name}", 1))])
+
+
+def merge_adapter(model: ProprioMLLM) -> None:
+    """Folds the active adapter into the backbone's weights and drops all adapters.
+
+    Raises:
+        ValueError: when there is no adapter.
+    """
+    if not isinstance(model.vlm, PeftModel):
+        raise ValueError("no adapter to merge")
+    vlm: Any = model.vlm.merge_and_unload()
+    model.vlm = vlm
 
 
 def use_adapter(model: ProprioMLLM, name: str) -> None:

@@ -2,8 +2,8 @@
 
 | group | parameters |
 |---|---|
-| `rows` | embeddings: with adapters, the replacement rows of the motion tokens; without, the whole tables |
-| `lora` | low-rank weights of the language model |
+| `rows` | embeddings: with adapters, the active one's rows of the motion tokens; without, the whole tables |
+| `lora` | the active adapter's low-rank weights of the language model |
 | `lm` | the language model's own layers |
 | `vision` | the vision tower without its merger |
 | `merger` | the vision tower's merger |
@@ -14,15 +14,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 
+from peft import PeftModel
 from torch import nn
 
 from proprio_mllm.model.modeling import ProprioMLLM
 
-__all__ = ["GROUPS", "group_of", "parameter_groups", "train_only"]
+__all__ = ["GROUPS", "adapter_of", "group_of", "parameter_groups", "train_only"]
 
 GROUPS: tuple[str, ...] = ("rows", "lora", "lm", "vision", "merger", "cse", "mpe", "point_map")
+_ADAPTER = re.compile(r"\.(?:lora_[AB]|trainable_tokens_delta)\.([^.]+)")
 
 
 def group_of(name: str) -> str:
@@ -43,15 +46,25 @@ def group_of(name: str) -> str:
     return "lm"
 
 
+def adapter_of(name: str) -> str | None:
+    """Name of the adapter that a parameter belongs to, None for all others."""
+    match = _ADAPTER.search(name)
+    return match.group(1) if match else None
+
+
 def parameter_groups(model: ProprioMLLM) -> dict[str, dict[str, nn.Parameter]]:
     """Parameters of the model by group and name; every parameter that can train is in exactly one group.
 
-    With adapters the full embedding tables are left out: they stay as they are, the replacement rows are trained.
+    With adapters, those that are not active are left out, and so are the full embedding tables: they stay as they are, the
+    adapter's rows are trained.
     """
+    active = model.vlm.active_adapters if isinstance(model.vlm, PeftModel) else []
     named = [(name, group_of(name), parameter) for name, parameter in model.named_parameters()]
     adapted = any("trainable_tokens_" in name for name, _, _ in named)
     groups: dict[str, dict[str, nn.Parameter]] = {group: {} for group in GROUPS}
     for name, group, parameter in named:
+        if (adapter := adapter_of(name)) is not None and adapter not in active:
+            continue
         if group == "tables":
             if adapted:
                 continue

@@ -7,7 +7,7 @@ import torch
 from configs.schema.model import ModelConfig
 from configs.validate import ConfigError, build
 from proprio_mllm.model import building
-from proprio_mllm.model.groups import GROUPS, parameter_groups, train_only
+from proprio_mllm.model.groups import GROUPS, adapter_of, parameter_groups, train_only
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 
 
@@ -113,6 +113,31 @@ def test_only_the_named_groups_change(chosen, cfg, build, examples, switch, shak
     assert changed
     assert changed <= allowed
     assert {next(g for g in chosen if name in groups[g]) for name in changed} == set(chosen)
+
+
+def test_inactive_adapters_do_not_train(cfg, build):
+    model, _ = build(cfg)
+    building.add_adapter(model, "actor")
+    building.add_adapter(model, "critic")
+    train_only(model, ["rows", "lora"])
+    trained = {adapter_of(name) for name, parameter in model.named_parameters() if parameter.requires_grad}
+    assert trained == {"critic"}
+
+
+def test_an_adapter_can_start_from_another_and_merging_keeps_the_function(cfg, build, examples, shake):
+    model, collate = build(cfg)
+    with pytest.raises(ValueError, match="no adapter to merge"):
+        building.merge_adapter(model)
+    building.add_adapter(model, "stage2")
+    shake(model)
+    batch = collate(examples)
+    first = _logits(model, batch)
+    building.add_adapter(model, "actor", start="stage2")
+    assert torch.equal(_logits(model, batch), first)
+    building.merge_adapter(model)
+    torch.testing.assert_close(_logits(model, batch), first, atol=1e-4, rtol=1e-4)
+    assert not any(adapter_of(name) for name, _ in model.named_parameters())
+    assert parameter_groups(model)["lm"]
 
 
 def test_unknown_and_empty_groups_are_refused(cfg, build):
