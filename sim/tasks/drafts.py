@@ -39,6 +39,10 @@ FAMILIES: Final[Mapping[str, tuple[str, ...]]] = {
 }
 
 
+#: Start states that make a type a load for two hands: a full pot, a packed box.
+_LOADS: Final[Mapping[str, Mapping[str, bool | float | str]]] = {"Pot": {"isFilledWithLiquid": True}, "Box": {"mass": 3.0}}
+
+
 class NoDraft(ValueError):  # noqa: N818 - it reports a draw that a room cannot offer
     """The room does not hold what a family needs; the message names both."""
 
@@ -179,7 +183,10 @@ class _Builder:
         """Adds a new two-handed object that can be carried to `target`, on other furniture."""
         object_type = self.choose(self.unused(self.scene.big, *((target,) if target else ())), "two-handed object")
         place = self.choose([s for s in self.scene.big[object_type] if s != target], "furniture for a two-handed object")
-        return self.add(object_type, place)
+        object_id = self.add(object_type, place)
+        if object_type in _LOADS:
+            self.draft.object_states[object_id] = dict(_LOADS[object_type])
+        return object_id
 
     def big_target(self) -> str:
         """Furniture that a two-handed object can be carried to from elsewhere."""
