@@ -1,0 +1,292 @@
+"""The catalogue of object types: what exists, how big and heavy it is, what can be done with it, and what it is built from.
+
+Types are data (`object_types.yaml`): a shape is a list of primitives, so a new type needs no code. Paper: the DualTHOR asset
+set; dimensions, masses and properties follow AI2-THOR's, the meshes are replaced by primitives.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import yaml
+
+from configs.validate import build
+
+__all__ = [
+    "CATALOGUE_PATH",
+    "OPTIONS",
+    "PROPERTIES",
+    "SHAPES",
+    "Catalogue",
+    "MovingSpec",
+    "ObjectType",
+    "Part",
+    "SurfaceSpec",
+    "load_catalogue",
+]
+
+CATALOGUE_PATH: Final = Path(__file__).parent / "object_types.yaml"
+_VERSION: Final = 1
+
+SOLIDS: Final = ("box", "cylinder", "cylinder_x", "cylinder_y", "capsule", "capsule_x", "capsule_y", "ellipsoid")
+HOLLOWS: Final = ("tray", "cup", "shell")
+SHAPES: Final = SOLIDS + HOLLOWS
+OPTIONS: Final = ("ghost", "flat", "handle", "toggle", "glow", "hidden", "liquid")
+PROPERTIES: Final = (
+    "static",
+    "pickupable",
+    "two_handed",
+    "openable",
+    "toggleable",
+    "receptacle",
+    "fillable",
+    "breakable",
+    "dirtyable",
+    "sliceable",
+    "cookable",
+    "used_up",
+    "heat_source",
+    "cold_source",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One primitive of a shape, in the type's frame.
+
+    Attributes:
+        shape: one of `SHAPES`.
+        center: (x, y, z) metres.
+        size: full extents along x, y, z, metres.
+        color: name in `Catalogue.colors`.
+        wall_m: wall thickness of hollow shapes, 0 for solids.
+        options: subset of `OPTIONS`.
+    """
+
+    shape: str
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    color: str
+    wall_m: float = 0.0
+    options: frozenset[str] = frozenset()
+
+    @staticmethod
+    def parse(row: Any, where: str) -> Part:
+        """Reads `[shape, cx, cy, cz, sx, sy, sz, colour, options ...]`.
+
+        Raises:
+            ValueError: on an unknown shape or option, missing numbers, or a hollow shape without wall thickness.
+        """
+        if not isinstance(row, list) or len(row) < 8:
+            raise ValueError(f"{where}: a part is [shape, cx, cy, cz, sx, sy, sz, colour, options ...], got {row!r}")
+        shape, numbers, color, rest = row[0], row[1:7], row[7], row[8:]
+        if shape not in SHAPES:
+            raise ValueError(f"{where}: unknown shape {shape!r}; allowed: {', '.join(SHAPES)}")
+        if not all(isinstance(value, int | float) for value in numbers) or min(numbers[3:]) <= 0:
+            raise ValueError(f"{where}: centre and positive extents must be six numbers, got {numbers!r}")
+        wall = 0.0
+        if shape in HOLLOWS:
+            if not rest or not isinstance(rest[0], int | float):
+                raise ValueError(f"{where}: {shape} needs a wall thickness after its colour, got {rest!r}")
+            wall, rest = float(rest[0]), rest[1:]
+        unknown = [option for option in rest if option not in OPTIONS]
+        if unknown:
+            raise ValueError(f"{where}: unknown option {unknown[0]!r}; allowed: {', '.join(OPTIONS)}")
+        x, y, z, sx, sy, sz = (float(value) for value in numbers)
+        return Part(shape, (x, y, z), (sx, sy, sz), str(color), wall, frozenset(rest))
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceSpec:
+    """A horizontal rectangle on which objects rest, in the type's frame.
+
+    Attributes:
+        name: unique within the type.
+        rect: centre x, centre y, extent x, extent y, metres.
+        z: height, metres.
+        clearance: free height above it, metres.
+        inside: reachable only when the object is open.
+        all_sides: reachable from every side, not only from the front (-y).
+    """
+
+    name: str
+    rect: tuple[float, float, float, float]
+    z: float
+    clearance: float
+    inside: bool = False
+    all_sides: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class MovingSpec:
+    """A door or drawer: a hinged or sliding body.
+
+    Attributes:
+        name: unique within the type.
+        joint: hinge or slide.
+        axis: joint axis, positive towards open.
+        at: anchor (x, y, z) metres.
+        range: closed and fully open position, radians or metres.
+        parts: primitives, in the frame of the type at the closed position.
+        surfaces: surfaces that travel with it.
+    """
+
+    name: str
+    joint: Literal["hinge", "slide"]
+    axis: tuple[float, float, float]
+    at: tuple[float, float, float]
+    range: tuple[float, float]
+    parts: tuple[Part, ...]
+    surfaces: tuple[SurfaceSpec, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectType:
+    """One of the 68 types.
+
+    Attributes:
+        name: AI2-THOR type name.
+        rooms: room categories in which it occurs.
+        size: bounding box (long x, short y, height z), metres.
+        mass: kilograms, None for fixtures.
+        properties: subset of `PROPERTIES`.
+        parts: primitives of the fixed body.
+        moving: doors and drawers.
+        surfaces: where objects can rest.
+        grips: `single` and `double` to preferred hand points in the type's frame, metres.
+        note: remark from the measurements.
+    """
+
+    name: str
+    rooms: tuple[str, ...]
+    size: tuple[float, float, float]
+    mass: float | None
+    properties: frozenset[str]
+    parts: tuple[Part, ...]
+    moving: tuple[MovingSpec, ...] = ()
+    surfaces: tuple[SurfaceSpec, ...] = ()
+    grips: Mapping[str, tuple[tuple[float, float, float], ...]] = field(default_factory=dict)
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        unknown = sorted(self.properties - set(PROPERTIES))
+        if unknown:
+            raise ValueError(f"{self.name}: unknown property {unknown[0]!r}; allowed: {', '.join(PROPERTIES)}")
+        strange = [key for key in self.grips if key not in ("single", "double")]
+        if strange:
+            raise ValueError(f"{self.name}: unknown grip {strange[0]!r}; allowed: single, double")
+
+    def has(self, name: str) -> bool:
+        """Whether the type has a property.
+
+        Raises:
+            ValueError: on a name outside `PROPERTIES`.
+        """
+        if name not in PROPERTIES:
+            raise ValueError(f"unknown property {name!r}; allowed: {', '.join(PROPERTIES)}")
+        return name in self.properties
+
+    @property
+    def pickupable(self) -> bool:
+        """Whether one hand can lift it."""
+        return "pickupable" in self.properties
+
+    @property
+    def two_handed(self) -> bool:
+        """Whether lifting it takes both hands."""
+        return "two_handed" in self.properties
+
+    @property
+    def openable(self) -> bool:
+        """Whether it has a door or drawer that moves; openable types without one (books, boxes) are modelled as they lie."""
+        return bool(self.moving)
+
+    @property
+    def toggleable(self) -> bool:
+        """Whether it can be switched on and off."""
+        return "toggleable" in self.properties
+
+    @property
+    def receptacle(self) -> bool:
+        """Whether objects can rest on or in it."""
+        return bool(self.surfaces) or any(moving.surfaces for moving in self.moving)
+
+    @property
+    def movable(self) -> bool:
+        """Whether it can be lifted, with one hand or two."""
+        return "pickupable" in self.properties or "two_handed" in self.properties
+
+    @property
+    def fillable(self) -> bool:
+        """Whether it can hold a liquid."""
+        return "fillable" in self.properties
+
+
+@dataclass(frozen=True, slots=True)
+class Catalogue:
+    """All types and the colours they use.
+
+    Attributes:
+        version: data version.
+        colors: name to (r, g, b, a) in [0, 1].
+        types: name to type, in the file's order; the order gives the type index of segmentation images.
+    """
+
+    version: int
+    colors: Mapping[str, tuple[float, float, float, float]]
+    types: Mapping[str, ObjectType]
+
+    def get(self, name: str) -> ObjectType:
+        """The type of that name.
+
+        Raises:
+            ValueError: on an unknown name; the message lists the known ones.
+        """
+        if name not in self.types:
+            raise ValueError(f"unknown object type {name!r}; allowed: {', '.join(self.types)}")
+        return self.types[name]
+
+    def index(self, name: str) -> int:
+        """Position of the type in the catalogue, the label of segmentation images."""
+        self.get(name)
+        return list(self.types).index(name)
+
+
+@functools.lru_cache(maxsize=4)
+def load_catalogue(path: Path = CATALOGUE_PATH) -> Catalogue:
+    """Reads and validates the catalogue.
+
+    Raises:
+        ValueError: on an unknown version, colour, shape, option or property.
+    """
+    raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if raw.get("version") != _VERSION:
+        raise ValueError(f"{path.name}: version {raw.get('version')!r} is not supported; expected {_VERSION}")
+    colors = {name: (*map(float, value), *([1.0] if len(value) == 3 else [])) for name, value in raw["colors"].items()}
+    types: dict[str, ObjectType] = {}
+    for name, entry in raw["types"].items():
+        entry = dict(entry)
+        entry["name"] = name
+        entry["properties"] = frozenset(entry["properties"])
+        entry["parts"] = _parts(entry["parts"], f"{name}.parts")
+        entry["moving"] = tuple(
+            build(MovingSpec, {**moving, "parts": _parts(moving["parts"], f"{name}.{moving['name']}")}, f"{name}.moving")
+            for moving in entry.get("moving", ())
+        )
+        entry["grips"] = {key: tuple(tuple(point) for point in points) for key, points in entry.get("grips", {}).items()}
+        entry["surfaces"] = tuple(build(SurfaceSpec, surface, f"{name}.surfaces") for surface in entry.get("surfaces", ()))
+        entry["size"] = tuple(entry["size"])
+        entry["rooms"] = tuple(entry["rooms"])
+        types[name] = ObjectType(**entry)
+        for part in (*types[name].parts, *(part for moving in types[name].moving for part in moving.parts)):
+            if part.color not in colors:
+                raise ValueError(f"{name}: unknown colour {part.color!r}; allowed: {', '.join(colors)}")
+    return Catalogue(raw["version"], colors, types)
+
+
+def _parts(rows: Any, where: str) -> tuple[Part, ...]:
+    return tuple(Part.parse(row, where) for row in rows)
