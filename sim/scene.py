@@ -35,6 +35,7 @@ __all__ = [
     "RobotForScene",
     "SceneKey",
     "build_spec",
+    "build_type_spec",
     "compile_scene",
 ]
 
@@ -104,8 +105,8 @@ def build_spec(key: SceneKey) -> mujoco.MjSpec:
     option.ls_iterations = 10
     option.impratio = 3.0
     visual: Any = spec.visual
-    visual.headlight.ambient = [0.35, 0.35, 0.35]
-    visual.headlight.diffuse = [0.35, 0.35, 0.35]
+    visual.headlight.ambient = [0.42, 0.42, 0.42]
+    visual.headlight.diffuse = [0.40, 0.40, 0.40]
     visual.headlight.specular = [0.0, 0.0, 0.0]
     visual.map.znear = 0.01
     visual.map.zfar = 20.0
@@ -132,6 +133,32 @@ def build_spec(key: SceneKey) -> mujoco.MjSpec:
         body.add_freejoint(name=f"{object_id}/free")
     if key.robot:
         _mount_robot(spec, key)
+    return spec
+
+
+def build_type_spec(type_name: str) -> mujoco.MjSpec:
+    """A type alone on a floor, seen by the camera `view` from the front, above and a little to the right."""
+    catalogue = load_catalogue()
+    kind = catalogue.get(type_name)
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    visual: Any = spec.visual
+    visual.headlight.ambient = [0.42, 0.42, 0.42]
+    visual.headlight.diffuse = [0.45, 0.45, 0.45]
+    visual.quality.offsamples = 0
+    stat: Any = spec.stat
+    stat.extent = 2.0
+    visual.map.znear = 0.01
+    body = spec.worldbody.add_body(name=f"{type_name}_1")
+    _add_object(spec, body, f"{type_name}_1", kind, catalogue, movable=kind.movable)
+    if kind.movable:
+        body.add_freejoint(name=f"{type_name}_1/free")
+    spec.worldbody.add_geom(
+        name="floor", type=int(mujoco.mjtGeom.mjGEOM_PLANE), size=[8.0, 8.0, 0.1], rgba=[0.85, 0.85, 0.83, 1.0], contype=1
+    )
+    reach = 1.35 * float(np.linalg.norm(kind.size))
+    view = spec.worldbody.add_camera(name="view", pos=[0.45 * reach, -0.9 * reach, kind.size[2] / 2 + 0.55 * reach], fovy=50.0)
+    _look_at(view, [0.0, 0.0, kind.size[2] / 2])
     return spec
 
 

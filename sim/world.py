@@ -25,6 +25,7 @@ from sim.metadata import world_metadata
 from sim.objects import STATE_NAMES, ObjectInstance, ObjectPlacement, ObjectState, Placement, copy_state, index_object
 from sim.placement import REACH_BAND_M, box_in_world, find_free_spot, resting_on
 from sim.recorder import FRAME_DT_S, MotionWindow, Recorder
+from sim.rendering import Renderer, View
 from sim.robots.build_solver import robot_kit
 from sim.robots.spec import SIDES, RobotSpec
 from sim.rooms import Room, load_room
@@ -111,7 +112,7 @@ class World:
         self.constraints: GraspConstraints | None = None
         self._steps = 0
         self._speeds: dict[str, float] = {}
-        self._renderers: dict[Any, Any] = {}
+        self._renderers: dict[tuple[int, int], Renderer] = {}
         if robot is not None:
             self._reset_robot(robot, start, pelvis_height_m, joint_positions or {})
         for name, values in (states or {}).items():
@@ -624,6 +625,42 @@ class World:
     def metadata(self) -> dict[str, Any]:
         """AI2-THOR-style state of the scene, see `sim.metadata`."""
         return world_metadata(self)
+
+    # ---- pictures -----------------------------------------------------------------------------------------------------------
+
+    def render(
+        self, camera: str = "head", height: int = 112, width: int = 112, *, depth: bool = False, segmentation: bool = False
+    ) -> View:
+        """Draws a camera of `sim.rendering.CAMERAS`; contexts are kept per size until `close`."""
+        renderer = self._renderers.get((height, width))
+        if renderer is None:
+            renderer = self._renderers[height, width] = Renderer(self, height, width)
+        return renderer.view(camera, depth=depth, segmentation=segmentation)
+
+    def visible_objects(
+        self, segmentation: NDArray[np.int32] | None = None, *, min_pixels: int = 6, range_m: float = 8.0
+    ) -> dict[str, int]:
+        """Objects in the head camera's view and the number of pixels each covers.
+
+        Args:
+            segmentation: (H, W) labels of a `View`; None draws 112 x 112.
+            min_pixels: fewest pixels that count, for an image of 112 x 112; scaled with the image's area.
+            range_m: farthest horizontal distance from the base.
+        """
+        if segmentation is None:
+            segmentation = self.render(segmentation=True).segmentation
+            assert segmentation is not None
+        least = max(1.0, min_pixels * segmentation.size / 112**2)
+        names = list(self.objects)
+        labels, counts = np.unique(segmentation[segmentation >= 0], return_counts=True)
+        found = {names[int(label)]: int(count) for label, count in zip(labels, counts, strict=True) if count >= least}
+        return {name: count for name, count in found.items() if self.distance_to(name) <= range_m}
+
+    def close(self) -> None:
+        """Frees OpenGL contexts; the world stays usable."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
 
     # ---- snapshots ----------------------------------------------------------------------------------------------------------
 
