@@ -1,0 +1,186 @@
+"""`stage=base`: stands in for the pretraining that released Qwen2.5-VL weights bring, at the tiny size only.
+
+Three parts, each needed (a small model trained on questions alone never binds words to image regions): dense, name-tied
+pretraining of the vision tower on the simulator's truth; grounding questions packed per image and image-to-text listing;
+planning demonstrations without proprioception. Its result is also the table row "Qwen2.5-VL-Ins" at this size. The paper has no
+such stage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from configs.schema.train import BaseConfig
+from proprio_mllm.model.batch import Batch, Collator, Example, ImageBatch
+from proprio_mllm.model.dense import DenseHead, DenseTargets, dense_targets
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.prompts import looking
+from proprio_mllm.training.sources import GROUNDING, Demos, Views
+
+__all__ = ["DenseObjective", "JointObjective", "grounding_accuracy", "plan_accuracy"]
+
+
+class _WithDense(nn.Module):
+    """Model and dense head as one module, so that one optimiser and one checkpoint hold both."""
+
+    def __init__(self, model: ProprioMLLM, head: DenseHead) -> None:
+        super().__init__()
+        self.model = model
+        self.head = head
+
+    def forward(self, batch: _JointBatch) -> tuple[Tensor, dict[str, float]]:
+        values: dict[str, float] = {}
+        total: Tensor | None = None
+        if batch.text is not None:
+            out = self.model(batch.text)
+            total = out.loss
+            accuracy = out.correct / max(out.supervised, 1)
+            values |= {f"{batch.kind}_loss": float(out.loss.detach()), f"{batch.kind}_accuracy": accuracy}
+            visual = out.visual
+        else:
+            assert batch.images is not None
+            visual = self.model.visual_tokens(batch.images)
+        if batch.dense is not None:
+            assert visual is not None
+            dense = self.head(visual, self.model.table, batch.dense)
+            values |= {"dense_recall": dense.recall, "dense_point_m": dense.point_error_m}
+            total = dense.total if total is None else total + batch.dense_weight * dense.total
+        assert total is not None
+        return total, values
+
+
+@dataclass(frozen=True, slots=True)
+class _JointBatch:
+    kind: Literal["dense", "look", "plan"]
+    text: Batch | None
+    images: ImageBatch | None
+    dense: DenseTargets | None
+    dense_weight: float
+
+
+class _Base:
+    """What both objectives share: the sources and the assembly of view batches."""
+
+    def __init__(self, model: ProprioMLLM, head: DenseHead, views: Views, cfg: BaseConfig, key: str) -> None:
+        self.module = _WithDense(model, head)
+        self.key = key
+        self._views, self._cfg = views, cfg
+        self._collator = Collator(model.processor, model.cfg)
+
+    def loss(self, module: nn.Module, batch: _JointBatch, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
+        """Loss of one batch; nothing is drawn."""
+        del generator
+        return module(batch)
+
+    def _view_batch(self, rng: np.random.Generator, size: int, questions: int) -> _JointBatch:
+        rows = [self._views.row(i) for i in rng.choice(self._views.split.train, size)]
+        targets = _targets(rows, self._collator, len(self._views.type_names))
+        if not questions:
+            return _JointBatch("dense", None, self._collator.images([row.view for row in rows]), targets, 1.0)
+        examples = []
+        for row in rows:
+            pairs = [self._views.listing(row), *self._views.pairs(row, GROUNDING, questions, rng)]
+            examples.append(Example(looking(pairs), (row.view,)))
+        return _JointBatch("look", self._collator(examples), None, targets, self._cfg.dense_weight)
+
+
+def _targets(rows: Sequence[Any], collator: Collator, types: int) -> DenseTargets:
+    segmentation = torch.from_numpy(np.stack([row.segmentation for row in rows]))
+    points = torch.from_numpy(np.stack([row.points_m for row in rows]))
+    side = segmentation.shape[1] // 28
+    del collator
+    return dense_targets(segmentation, points, (side, segmentation.shape[2] // 28), types)
+
+
+class DenseObjective(_Base):
+    """Dense, name-tied pretraining: which types each visual token shows, and its mean point."""
+
+    name = "base/dense"
+
+    def batch(self, rng: np.random.Generator, size: int) -> _JointBatch:
+        """Views with their dense truth."""
+        return self._view_batch(rng, size, 0)
+
+
+class JointObjective(_Base):
+    """Mixed batches: packed grounding questions and listing with the dense loss, and planning without proprioception."""
+
+    name = "base/joint"
+
+    def __init__(self, model: ProprioMLLM, head: DenseHead, views: Views, demos: Demos, cfg: BaseConfig, key: str) -> None:
+        super().__init__(model, head, views, cfg, key)
+        self._demos = demos
+
+    def batch(self, rng: np.random.Generator, size: int) -> _JointBatch:
+        """A batch of views or of planning steps."""
+        if rng.random() >= self._cfg.plan_share:
+            return self._view_batch(rng, size, self._cfg.questions)
+        examples = [self._demos.example(i, None) for i in rng.choice(self._demos.split.train, size)]
+        return _JointBatch("plan", self._collator(examples), None, None, 0.0)
+
+
+@torch.no_grad()
+def grounding_accuracy(
+    model: ProprioMLLM,
+    views: Views,
+    kinds: Sequence[str] = GROUNDING,
+    limit: int = 200,
+    seed: int = 0,
+    tokens: Any = None,
+) -> dict[str, float]:
+    """Share of right answers about objects in held-out views, by kind, with the majority answer's share beside it.
+
+    Args:
+        model: in evaluation mode.
+        views: source; only held-out rows are asked about.
+        kinds: kinds of question.
+        limit: number of views; each is asked one question of each kind.
+        seed: of the choice of objects.
+        tokens: motion tokenizer, for questions with proprioception; None asks without.
+    """
+    collator = Collator(model.processor, model.cfg)
+    rng = np.random.default_rng(seed)
+    result: dict[str, float] = {}
+    rows = [views.row(i) for i in views.split.test[:limit]]
+    for kind in kinds:
+        asked: list[tuple[Example, str]] = []
+        for row in rows:
+            pairs = views.pairs(row, (kind,), 1, rng)
+            if pairs:
+                motion = None if tokens is None else tokens.encode_window(row.motion)
+                asked.append((Example(looking([(pairs[0][0], "")], motion), (row.view,)), pairs[0][1]))
+        if not asked:
+            continue
+        right = 0
+        for start in range(0, len(asked), 16):
+            chunk = asked[start : start + 16]
+            replies = model.reply(collator([example for example, _ in chunk], generation=True), 10)
+            right += sum(reply.strip() == answer for reply, (_, answer) in zip(replies, chunk, strict=True))
+        answers = [answer for _, answer in asked]
+        result[f"{kind}_accuracy"] = right / len(asked)
+        result[f"{kind}_majority"] = max(answers.count(a) for a in set(answers)) / len(asked)
+    result["asked_views"] = float(len(rows))
+    return result
+
+
+@torch.no_grad()
+def plan_accuracy(model: ProprioMLLM, demos: Demos, tokens: Any = None, limit: int = 200) -> dict[str, float]:
+    """Share of held-out expert steps that the model's greedy reply repeats exactly, and whose action name it repeats."""
+    collator = Collator(model.processor, model.cfg)
+    motion = None if tokens is None else demos.tokens(tokens)
+    order = demos.split.test[:limit]
+    exact = verb = 0
+    for start in range(0, len(order), 16):
+        chunk = [int(i) for i in order[start : start + 16]]
+        examples = [demos.example(i, None if motion is None else motion[i].tolist(), answered=False) for i in chunk]
+        for index, reply in zip(chunk, model.reply(collator(examples, generation=True), 40), strict=True):
+            target = demos.target(index)
+            exact += reply.strip() == target
+            verb += reply.split("(")[0].strip() == target.split("(")[0]
+    return {"plan_exact": exact / max(len(order), 1), "plan_verb": verb / max(len(order), 1), "plan_steps": float(len(order))}

@@ -1,0 +1,107 @@
+"""`stage=tokenizer` (paper, stage 1): the motion VQ-VAE, on retargeted clips and on the simulator's proprioception windows.
+
+The windows are what a planner encodes at run time; training on clips alone would leave them out of distribution. One tokenizer
+serves both robots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from data.motion import KEY_BODY_COUNT
+from proprio_mllm.model.geometry import KEY_BODIES
+from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.training.sources import Clips, held_out
+
+__all__ = ["MotionObjective", "MotionWindows", "tokenizer_metrics"]
+
+HANDS_AND_FEET = [i for i, name in enumerate(KEY_BODIES) if name.endswith(("hand", "ankle"))]
+
+
+class MotionWindows:
+    """Windows of clips and of recorded proprioception, with a held-out part of each."""
+
+    def __init__(self, clips: Clips, recorded: Sequence[NDArray[np.float32]], frames: int, clip_share: float = 0.5) -> None:
+        self.clips, self.frames, self.clip_share = clips, frames, clip_share
+        rows = np.concatenate([part for part in recorded if len(part)]) if any(len(part) for part in recorded) else None
+        if rows is None:
+            self.train = self.test = np.zeros((0, frames, clips.motions[0].shape[1]), dtype=np.float32)
+        else:
+            mask = np.array([held_out(f"window {i // 64}") for i in range(len(rows))], dtype=bool)
+            self.train, self.test = rows[~mask], rows[mask]
+
+    def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.float32]:
+        """Training windows (size, frames, F)."""
+        out = []
+        for _ in range(size):
+            if len(self.train) == 0 or rng.random() < self.clip_share:
+                out.append(self.clips.window(int(rng.choice(self.clips.split.train)), self.frames, rng))
+            else:
+                out.append(self.train[int(rng.integers(len(self.train)))])
+        return np.stack(out)
+
+    def statistics(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Mean and deviation (F,) over all training frames, clips and windows weighted alike."""
+        clips = np.concatenate([self.clips.motions[int(i)] for i in self.clips.split.train])
+        parts = [clips] if len(self.train) == 0 else [clips, self.train.reshape(-1, clips.shape[1])]
+        mean = np.mean([part.mean(axis=0) for part in parts], axis=0)
+        square = np.mean([((part - mean) ** 2).mean(axis=0) for part in parts], axis=0)
+        return mean.astype(np.float32), np.sqrt(square).astype(np.float32)
+
+
+class MotionObjective:
+    """Reconstruction, codebook and commitment loss (paper, Eq. 2)."""
+
+    name = "tokenizer"
+
+    def __init__(self, tokenizer: MotionTokenizer, windows: MotionWindows, key: str) -> None:
+        self.module = tokenizer
+        self.key = key
+        self._windows = windows
+
+    def batch(self, rng: np.random.Generator, size: int) -> Tensor:
+        """Windows (B, T, F)."""
+        return torch.from_numpy(self._windows.draw(rng, size))
+
+    def loss(self, module: nn.Module, batch: Tensor, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
+        """The paper's loss; dead codes are replaced by vectors drawn with `generator`."""
+        out = module(batch, generator)
+        return out.total, {
+            "reconstruction": float(out.reconstruction.detach()),
+            "velocity": float(out.velocity.detach()),
+            "commitment": float(out.commitment.detach()),
+            "perplexity": float(out.perplexity),
+        }
+
+
+@torch.no_grad()
+def tokenizer_metrics(tokenizer: MotionTokenizer, windows: MotionWindows, seed: int = 0) -> dict[str, float]:
+    """Reconstruction of held-out clips and windows: MPJPE and hand and foot error in mm, height error in mm, codes used."""
+    rng = np.random.default_rng(seed)
+    clips = [windows.clips.window(int(i), windows.frames, rng) for i in windows.clips.split.test for _ in range(4)]
+    result: dict[str, float] = {}
+    used: set[int] = set()
+    for name, rows in (("clips", np.stack(clips) if clips else None), ("windows", windows.test[:512])):
+        if rows is None or len(rows) == 0:
+            continue
+        truth = torch.from_numpy(rows)
+        ids = tokenizer.encode(truth)
+        used |= set(ids.flatten().tolist())
+        rebuilt = tokenizer.decode(ids)
+        keys = 3 * KEY_BODY_COUNT
+        error = (rebuilt[..., :keys] - truth[..., :keys]).unflatten(-1, (KEY_BODY_COUNT, 3)).norm(dim=-1)  # (B, T, K)
+        result[f"{name}_mpjpe_mm"] = 1000.0 * float(error.mean())
+        result[f"{name}_hands_feet_mm"] = 1000.0 * float(error[..., HANDS_AND_FEET].mean())
+        result[f"{name}_height_mm"] = 1000.0 * float((rebuilt[..., keys] - truth[..., keys]).abs().mean())
+        result[f"{name}_count"] = float(len(rows))
+    sample = torch.from_numpy(windows.draw(rng, 512))
+    counts = torch.bincount(tokenizer.encode(sample).flatten(), minlength=tokenizer.cfg.codes).double()
+    share = counts / counts.sum()
+    result["codes_used"] = float((counts > 0).double().mean())
+    result["perplexity"] = float(torch.exp(-(share[share > 0] * share[share > 0].log()).sum()))
+    return result

@@ -1,0 +1,66 @@
+"""Where stages keep their outputs, and when an output is current.
+
+    <output>/<model>/data/{clips,views,demos}      shards, shared by all variants
+    <output>/<model>/shared/{text,base,pointmap,tokenizer}
+    <output>/<model>/<variant>/{alignment,selu}
+
+A finished stage writes `done.json` with its key (hash of configuration and inputs) and its metrics; the stage is current while the
+key is the one that the present configuration and inputs give.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from configs.schema.train import TrainConfig
+from data.shards import config_hash
+
+__all__ = ["StagePaths", "finish", "finished_key", "stage_key"]
+
+_SHARED = ("text", "base", "pointmap", "tokenizer")
+
+
+class StagePaths:
+    """Folders of one configuration."""
+
+    def __init__(self, cfg: TrainConfig) -> None:
+        self.root = Path(cfg.output) / cfg.model.name
+        self.variant = cfg.variant
+
+    def shards(self, kind: str) -> Path:
+        """Folder of the `clips`, `views` or `demos` shards."""
+        return self.root / "data" / kind
+
+    def stage(self, name: str) -> Path:
+        """Folder of a training stage's output."""
+        return self.root / ("shared" if name in _SHARED else self.variant) / name
+
+    def model(self, name: str) -> Path:
+        """The model folder that a stage leaves behind."""
+        return self.stage(name) / "model"
+
+
+def stage_key(cfg: object, seed: int, inputs: Mapping[str, str]) -> str:
+    """Key of a stage: hash of its configuration dataclass, the seed, and the keys or hashes of its inputs."""
+    values = dataclasses.asdict(cfg) if dataclasses.is_dataclass(cfg) and not isinstance(cfg, type) else cfg
+    return config_hash({"config": values, "seed": seed, "inputs": dict(inputs)})
+
+
+def finished_key(folder: Path) -> str | None:
+    """Key of the finished output in a folder, None when there is none."""
+    path = folder / "done.json"
+    if not path.is_file():
+        return None
+    return str(json.loads(path.read_text(encoding="utf-8"))["key"])
+
+
+def finish(folder: Path, key: str, metrics: Mapping[str, Any]) -> None:
+    """Marks a stage's output as complete."""
+    temporary = folder / "done.json.tmp"
+    temporary.write_text(json.dumps({"key": key, "metrics": dict(metrics)}, indent=1) + "\n", encoding="utf-8")
+    os.replace(temporary, folder / "done.json")
