@@ -1,8 +1,8 @@
 """Turns drafts into tasks: positions of objects, the robot's start, wording, budget; and samples training tasks without end.
 
 A training task is a function of its seed, its room and nothing else. Benchmark tasks come from the same code with other seeds:
-`TRAIN_SEEDS` and `BENCHMARK_SEEDS` do not meet, and every draw is keyed by the seed and the split, so no training task repeats a
-benchmark task's stream. Start poses, pelvis heights, objects, distractors and wordings all vary.
+`TRAIN_SEEDS` and `BENCHMARK_SEEDS` do not meet, and every draw is keyed by the seed and the split, so no training task
+repeats a benchmark task's stream. Start poses, pelvis heights, objects, distractors and wordings all vary.
 """
 
 from __future__ import annotations

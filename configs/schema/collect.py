@@ -1,0 +1,51 @@
+"""Frozen configuration of data collection in the simulator (`python -m sim.collect`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+__all__ = ["CollectConfig"]
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """What is collected, how much, and where it goes.
+
+    Attributes:
+        kind: `views` (posed views) or `demos` (expert steps).
+        out: shard folder.
+        count: views, or episodes.
+        robots: robots in turn.
+        rooms: rooms in turn.
+        seed: every draw is keyed by it.
+        image_size: rows and columns of the head camera's pictures.
+        part_size: views or episodes per part file.
+        workers: processes; 1 stays in this one.
+        views_per_world: views drawn from one arrangement of objects.
+        noise: demos: probability that a perturbed step is executed in place of the expert's, whose choice is recorded.
+        medium_share: demos: share of episodes at medium difficulty, so that recoveries appear.
+    """
+
+    kind: Literal["views", "demos"]
+    out: str
+    count: int
+    robots: tuple[str, ...] = ("h1", "x1")
+    rooms: tuple[str, ...] = ("kitchen_1", "living_room_1")
+    seed: int = 0
+    image_size: int = 112
+    part_size: int = 240
+    workers: int = 1
+    views_per_world: int = 48
+    noise: float = 0.15
+    medium_share: float = 0.15
+
+    def __post_init__(self) -> None:
+        for name in ("count", "image_size", "part_size", "workers", "views_per_world"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("noise", "medium_share"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must be within [0, 1], got {getattr(self, name)}")
+        if not self.robots or not self.rooms:
+            raise ValueError(f"robots and rooms must not be empty, got {self.robots} and {self.rooms}")
