@@ -1,0 +1,132 @@
+"""`stage=alignment` (paper, stage 2): motion, image and text are aligned through LoRA, first apart and then together.
+
+| phase | pairs | trains | frozen |
+|---|---|---|---|
+| text (2a-i) | motion to text, text to motion, masked motion | motion rows, LoRA | vision, merger, CSE |
+| image (2a-ii) | motion and image to text | motion rows, CSE, MPE | language model's LoRA, vision |
+| joint (2b) | all of them | motion rows, LoRA, CSE, MPE, merger | vision, backbone |
+
+"Freeze the image and text weights separately" leaves open which weights; this reading freezes one modality's while the other's
+pairs train. Besides clip captions, motion and image to text holds questions about the robot's own body in its scene (which arm
+reaches an object, how far the body must go down). A share of planning demonstrations, with motion tokens in the prompt, keeps the
+planner's format; the paper does not mention any such replay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from configs.schema.train import AlignmentConfig
+from proprio_mllm.model.batch import Batch, Collator, Example
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.model.prompts import described_motion, filled_motion, looking, made_motion
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views
+
+__all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Phase"]
+
+Kind = Literal["say", "do", "fill", "say_image", "body", "plan"]
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """What a phase reads and trains (`proprio_mllm.model.groups`)."""
+
+    groups: tuple[str, ...]
+    kinds: tuple[Kind, ...]
+
+
+PHASES: Final[Mapping[str, Phase]] = {
+    "text": Phase(("rows", "lora"), ("say", "do", "fill")),
+    "image": Phase(("rows", "cse", "mpe"), ("say_image", "body")),
+    "joint": Phase(("rows", "lora", "cse", "mpe", "merger"), ("say", "do", "fill", "say_image", "body", "body", "plan")),
+}
+
+
+class AlignmentData:
+    """Examples of every kind, with motion tokens computed once."""
+
+    def __init__(
+        self, model: ProprioMLLM, tokenizer: MotionTokenizer, clips: Clips, views: Views, demos: Demos, cfg: AlignmentConfig
+    ) -> None:
+        self.tokenizer, self.clips, self.views, self.demos = tokenizer, clips, views, demos
+        self._cfg, self._style, self._collator = cfg, model.cfg.prompt, Collator(model.processor, model.cfg)
+        self._demo_tokens = demos.tokens(tokenizer)
+        with_images = [i for i, images in enumerate(clips.reader.column("image_frames")) if images]
+        self._pictured = np.intersect1d(np.asarray(with_images, dtype=np.int64), clips.split.train)
+
+    def _encode(self, windows: NDArray[np.float32]) -> list[list[int]]:
+        return self.tokenizer.encode(torch.from_numpy(windows)).tolist()
+
+    def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> Batch:
+        """A batch of one kind from the training rows."""
+        if kind == "plan":
+            rows = rng.choice(self.demos.split.train, size)
+            return self._collator([self.demos.example(i, self._demo_tokens[i].tolist()) for i in rows])
+        if kind == "body":
+            return self._collator([self._body(int(i), rng) for i in rng.choice(self.views.split.train, size)])
+        if kind == "say_image":
+            return self._collator([self._say_image(int(i), rng) for i in rng.choice(self._pictured, size)])
+        frames = self.tokenizer.cfg.window
+        rows = rng.choice(self.clips.split.train, size)
+        codes = self._encode(np.stack([self.clips.window(int(i), frames, rng) for i in rows]))
+        return self._collator([self._motion_text(kind, int(i), code, rng) for i, code in zip(rows, codes, strict=True)])
+
+    def _motion_text(self, kind: Kind, clip: int, codes: Sequence[int], rng: np.random.Generator) -> Example:
+        caption = self.clips.caption(clip, rng)
+        if kind == "say":
+            return Example(described_motion(codes, caption, style=self._style))
+        if kind == "do":
+            return Example(made_motion(caption, codes, self._style))
+        hidden = rng.random(len(codes)) < self._cfg.mask
+        return Example(filled_motion([None if h else c for c, h in zip(codes, hidden, strict=True)], codes, self._style))
+
+    def _say_image(self, clip: int, rng: np.random.Generator) -> Example:
+        view, motion = self.clips.view(clip, rng)
+        codes = self.tokenizer.encode_window(motion)
+        return Example(described_motion(codes, self.clips.caption(clip, rng), image=True, style=self._style), (view,))
+
+    def _body(self, index: int, rng: np.random.Generator) -> Example:
+        row = self.views.row(index)
+        half = self._cfg.questions // 2
+        pairs = self.views.pairs(row, BODY_RELATIVE, self._cfg.questions - half, rng)
+        pairs += self.views.pairs(row, GROUNDING, half, rng)
+        codes = self.tokenizer.encode_window(row.motion)
+        return Example(looking(pairs or [self.views.listing(row)], codes, self._style), (row.view,))
+
+
+class AlignmentObjective:
+    """One phase."""
+
+    def __init__(self, model: ProprioMLLM, data: AlignmentData, phase: str, cfg: AlignmentConfig, key: str) -> None:
+        if phase not in PHASES:
+            raise ValueError(f"alignment phase {phase!r}; allowed: {', '.join(PHASES)}")
+        self.name = f"alignment/{phase}"
+        self.module: nn.Module = model
+        self.key = key
+        self._data, self._cfg, self._kinds = data, cfg, PHASES[phase].kinds
+
+    def batch(self, rng: np.random.Generator, size: int) -> tuple[Kind, Batch]:
+        """A batch of one kind, drawn anew each step."""
+        others = tuple(kind for kind in self._kinds if kind != "plan")
+        if "plan" in self._kinds and rng.random() < self._cfg.plan_share:
+            kind: Kind = "plan"
+        else:
+            kind = others[int(rng.integers(len(others)))]
+        return kind, self._data.batch(kind, rng, size)
+
+    def loss(
+        self, module: nn.Module, batch: tuple[Kind, Batch], generator: torch.Generator
+    ) -> tuple[Tensor, Mapping[str, float]]:
+        """Cross-entropy over the answers; nothing is drawn."""
+        del generator
+        kind, inputs = batch
+        out = module(inputs)
+        return out.loss, {f"{kind}_loss": float(out.loss.detach()), f"{kind}_accuracy": out.correct / max(out.supervised, 1)}

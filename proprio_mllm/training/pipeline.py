@@ -1,0 +1,232 @@
+"""Runs the training stages in order, each skipped while its output is current.
+
+base needs views, demos and clips (for the tokenizer's text); pointmap needs views; tokenizer needs clips and the windows of views
+and demos; alignment needs base, pointmap and tokenizer; selu needs alignment. The variants of the ablation share everything up
+to alignment and then train with the same budget.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from configs.schema.model import ModelConfig
+from configs.schema.train import LoopConfig, TrainConfig
+from data.shards import ShardReader, decode_motion
+from proprio_mllm.model.building import add_adapter, build_model, build_point_map, build_processor, load_model, save_model
+from proprio_mllm.model.dense import DenseHead
+from proprio_mllm.model.groups import GROUPS, train_only
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective
+from proprio_mllm.training.base import DenseObjective, JointObjective, grounding_accuracy, plan_accuracy
+from proprio_mllm.training.geometry_stage import PointMapObjective, point_map_error
+from proprio_mllm.training.loop import Objective, run_loop
+from proprio_mllm.training.metrics import MetricWriter
+from proprio_mllm.training.motion_stage import MotionObjective, MotionWindows, tokenizer_metrics
+from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_key
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views, shard_hash
+from proprio_mllm.training.text import corpus, whole_words
+
+__all__ = ["STAGES", "Pipeline", "variant_model"]
+
+logger = logging.getLogger(__name__)
+
+Metrics = dict[str, float]
+
+
+def variant_model(model: ModelConfig, variant: str) -> ModelConfig:
+    """The model's configuration with the ablated parts switched off.
+
+    Raises:
+        ValueError: on an unknown variant.
+    """
+    if variant not in ("full", "no_mpe", "no_cse", "no_mpe_cse"):
+        raise ValueError(f"variant {variant!r}; allowed: full, no_mpe, no_cse, no_mpe_cse")
+    mpe = dataclasses.replace(model.mpe, mode="mrope") if "mpe" in variant else model.mpe
+    cse = dataclasses.replace(model.cse, enabled=False) if "cse" in variant else model.cse
+    return dataclasses.replace(model, mpe=mpe, cse=cse)
+
+
+def base_model_config(model: ModelConfig) -> ModelConfig:
+    """The plain backbone: no MPE, no CSE, no proprioception."""
+    return dataclasses.replace(variant_model(model, "no_mpe_cse"), proprioception=False)
+
+
+class Pipeline:
+    """The stages of one configuration.
+
+    Args:
+        cfg: configuration.
+        collect_rollouts: runs an actor in the simulator and writes `rollouts` shards; given by the entry point, because
+            training does not know the simulator.
+    """
+
+    def __init__(self, cfg: TrainConfig, collect_rollouts: Callable[..., Any] | None = None) -> None:
+        self.cfg = cfg
+        self.paths = StagePaths(cfg)
+        self._collect = collect_rollouts
+
+    # ---- what a stage depends on --------------------------------------------------------------------------------------------
+
+    def key(self, name: str) -> str:
+        """Key of a stage's output under the present configuration and inputs."""
+        cfg, shards = self.cfg, self.paths.shards
+        plain = dataclasses.asdict(base_model_config(cfg.model))
+        if name == "base":
+            inputs = {kind: shard_hash(shards(kind)) for kind in ("views", "demos", "clips")}
+            return stage_key({"base": dataclasses.asdict(cfg.base), "model": plain}, cfg.seed, inputs)
+        if name == "pointmap":
+            wanted = {"loop": dataclasses.asdict(cfg.pointmap), "map": dataclasses.asdict(cfg.model.point_map)}
+            return stage_key(wanted, cfg.seed, {"views": shard_hash(shards("views"))})
+        if name == "tokenizer":
+            inputs = {kind: shard_hash(shards(kind)) for kind in ("clips", "views", "demos")}
+            wanted = {"loop": dataclasses.asdict(cfg.tokenizer), "motion": dataclasses.asdict(cfg.model.motion)}
+            return stage_key(wanted, cfg.seed, inputs)
+        model = dataclasses.asdict(variant_model(cfg.model, cfg.variant))
+        if name == "alignment":
+            inputs = {stage: self.key(stage) for stage in ("base", "pointmap", "tokenizer")}
+            return stage_key({"alignment": dataclasses.asdict(cfg.alignment), "model": model}, cfg.seed, inputs)
+        if name == "selu":
+            return stage_key({"selu": dataclasses.asdict(cfg.selu)}, cfg.seed, {"alignment": self.key("alignment")})
+        raise ValueError(f"stage {name!r} has no key; allowed: {', '.join(STAGES)}")
+
+    def run(self, name: str) -> Metrics | None:
+        """Runs a stage unless its output is current; returns its metrics, None when it was skipped."""
+        folder, key = self.paths.stage(name), self.key(name)
+        if finished_key(folder) == key and not self.cfg.overwrite:
+            logger.info("%s: current, skipped (%s)", name, folder)
+            return None
+        folder.mkdir(parents=True, exist_ok=True)
+        began = time.monotonic()
+        metrics = STAGES[name](self, folder, key)
+        metrics["seconds"] = round(time.monotonic() - began, 1)
+        finish(folder, key, metrics)
+        logger.info("%s: %s", name, ", ".join(f"{k} {v:.4g}" for k, v in metrics.items()))
+        return metrics
+
+    def loop(self, objective: Objective, cfg: LoopConfig, folder: Path) -> None:
+        """Runs one objective with this configuration's seed and logger."""
+        folder.mkdir(parents=True, exist_ok=True)
+        writer = MetricWriter(folder, objective.name, self.cfg.logger, {"key": objective.key})
+        try:
+            run_loop(objective, cfg, folder, self.cfg.seed, writer, self.cfg.resume)
+        finally:
+            writer.close()
+
+    # ---- stages -------------------------------------------------------------------------------------------------------------
+
+    def _base(self, folder: Path, key: str) -> Metrics:
+        cfg, plain = self.cfg, base_model_config(self.cfg.model)
+        if cfg.model.weights is not None:
+            logger.info("base: %s has pretrained weights, nothing to do", cfg.model.name)
+            return {}
+        views, demos = Views(self.paths.shards("views"), plain), Demos(self.paths.shards("demos"), plain)
+        clips = Clips(self.paths.shards("clips"))
+        processor = build_processor(plain, corpus(plain, views, demos, clips, cfg.seed), whole_words(views))
+        model = build_model(plain, processor, cfg.seed)
+        head = DenseHead(model, views.type_names)
+        model.requires_grad_(True)
+        dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
+        self._train_dense(dense, model, head, folder / "dense")
+        model.requires_grad_(True)
+        joint = JointObjective(model, head, views, demos, cfg.base, f"{key}/joint")
+        self.loop(joint, cfg.base.joint, folder / "joint")
+        save_model(model.eval(), self.paths.model("base"))
+        return {**grounding_accuracy(model, views), **plan_accuracy(model, demos)}
+
+    def _train_dense(self, objective: DenseObjective, model: ProprioMLLM, head: DenseHead, folder: Path) -> None:
+        chosen = {id(p) for p in train_only(model, ("vision", "merger", "rows"))} | {id(p) for p in head.parameters()}
+        for parameter in objective.module.parameters():
+            parameter.requires_grad_(id(parameter) in chosen)
+        self.loop(objective, self.cfg.base.dense, folder)
+
+    def _pointmap(self, folder: Path, key: str) -> Metrics:
+        encoder = build_point_map(dataclasses.replace(self.cfg.model))
+        if encoder is None or not list(encoder.parameters()):
+            return {}
+        views = Views(self.paths.shards("views"), self.cfg.model)
+        if self.cfg.model.point_map.encoder == "sim":
+            encoder.requires_grad_(True)
+            self.loop(PointMapObjective(encoder, views, key), self.cfg.pointmap, folder)
+        return point_map_error(encoder, views)
+
+    def _tokenizer(self, folder: Path, key: str) -> Metrics:
+        motion = self.cfg.model.motion
+        clips = Clips(self.paths.shards("clips"))
+        recorded = []
+        for kind in ("views", "demos"):
+            rows = [decode_motion(row)[-motion.window :] for row in ShardReader(self.paths.shards(kind), kind).column("motion")]
+            recorded.append(np.stack(rows) if rows else np.zeros((0, motion.window, motion.features), dtype=np.float32))
+        windows = MotionWindows(clips, recorded, motion.window)
+        tokenizer = _seeded(lambda: MotionTokenizer(motion), self.cfg.seed)
+        tokenizer.set_normalisation(*windows.statistics())
+        self.loop(MotionObjective(tokenizer, windows, key), self.cfg.tokenizer, folder)
+        tokenizer.eval().save(self.paths.model("tokenizer"))
+        return tokenizer_metrics(tokenizer, windows)
+
+    def _start_alignment(self) -> ProprioMLLM:
+        """The base model with this variant's MPE and CSE and the trained point map."""
+        cfg = variant_model(self.cfg.model, self.cfg.variant)
+        point_map = None
+        if cfg.cse.enabled:
+            point_map = _seeded(lambda: build_point_map(cfg), self.cfg.seed)
+            if point_map is not None and cfg.point_map.encoder == "sim":
+                _load_trained(point_map, self.paths.stage("pointmap") / "checkpoint" / "model.safetensors")
+        if cfg.weights is None:
+            base = load_model(self.paths.model("base"))
+            local = dataclasses.replace(cfg, weights=str(self.paths.model("base") / "vlm"))
+            model = build_model(local, base.processor, self.cfg.seed, point_map)
+            model.cfg = cfg
+        else:
+            model = build_model(cfg, build_processor(cfg), self.cfg.seed, point_map)
+        _seeded(lambda: add_adapter(model), self.cfg.seed)
+        return model
+
+    def _alignment(self, folder: Path, key: str) -> Metrics:
+        model = self._start_alignment()
+        tokenizer = MotionTokenizer.load(self.paths.model("tokenizer"))
+        views, demos = Views(self.paths.shards("views"), model.cfg), Demos(self.paths.shards("demos"), model.cfg)
+        data = AlignmentData(model, tokenizer, Clips(self.paths.shards("clips")), views, demos, self.cfg.alignment)
+        for phase, loop in (("text", self.cfg.alignment.text), ("image", self.cfg.alignment.image), ("joint", self.cfg.alignment.joint)):
+            train_only(model, PHASES[phase].groups)
+            self.loop(AlignmentObjective(model, data, phase, self.cfg.alignment, f"{key}/{phase}"), loop, folder / phase)
+        save_model(model.eval(), self.paths.model("alignment"), tokenizer)
+        asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=tokenizer)
+        return {**asked, **plan_accuracy(model, demos, tokenizer)}
+
+    def _selu(self, folder: Path, key: str) -> Metrics:
+        from proprio_mllm.training.selu import run_selu
+
+        if self._collect is None:
+            raise ValueError("stage 'selu' needs rollouts: no collector was given")
+        return run_selu(self, folder, key, self._collect)
+
+
+def _seeded(make: Callable[[], Any], seed: int) -> Any:
+    import torch
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return make()
+
+
+def _load_trained(module: Any, path: Path) -> None:
+    from safetensors.torch import load_file
+
+    module.load_state_dict(load_file(path))
+
+
+STAGES: Final[Mapping[str, Callable[[Pipeline, Path, str], Metrics]]] = {
+    "base": Pipeline._base,
+    "pointmap": Pipeline._pointmap,
+    "tokenizer": Pipeline._tokenizer,
+    "alignment": Pipeline._alignment,
+    "selu": Pipeline._selu,
+}
