@@ -49,20 +49,21 @@ class Crouch:
         return self.sole_error_m <= SOLE_TOLERANCE_M and self.balance_margin_m > 0.0
 
 
-def crouch(robot: RobotModel, pelvis_height_m: float, q: Array | None = None) -> Crouch:
+def crouch(robot: RobotModel, pelvis_height_m: float, q: Array | None = None, lean_rad: float | None = None) -> Crouch:
     """Solves the legs for a pelvis height, with the smallest forward lean that makes it feasible.
 
     Args:
         robot: kinematics.
         pelvis_height_m: pelvis above the floor.
         q: (J,) posture of the other joints; arms at rest when None.
+        lean_rad: the forward lean to use; None searches for the smallest that is feasible.
 
     Returns:
         The first feasible posture over leans of 0 to 0.7 rad, or the one with the smallest sole error when none is.
     """
     posture = robot.arm_posture(robot.posture(), "rest") if q is None else np.array(q, dtype=float)
     best: Crouch | None = None
-    for pitch_rad in LEANS_RAD:
+    for pitch_rad in LEANS_RAD if lean_rad is None else (lean_rad,):
         found = _crouch_with_lean(robot, pelvis_height_m, float(pitch_rad), posture)
         if found.feasible:
             return found

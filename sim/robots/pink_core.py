@@ -53,9 +53,9 @@ class PinkCore:
         self._owner = np.array([self._arm_of(name) for name in self._full_names])
 
     def _model_at(self, pelvis_height_m: float) -> tuple[pin.Model, pin.Data, NDArray[np.int64], float]:
-        """Reduced model with the root and all other joints locked at the crouch; cached per centimetre."""
+        """Reduced model with the root and all other joints locked at the crouch; cached by height."""
         crouch = self._crouches.at(pelvis_height_m)
-        key = round(pelvis_height_m * 1000)
+        key = round(pelvis_height_m * 1e6)
         if key not in self._reduced:
             root = np.array([0.0, 0.0, 0.0, *root_quaternion(0.0, crouch.pelvis_pitch_rad)])
             reference = self.robot.configuration(root, crouch.q)
