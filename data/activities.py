@@ -1,0 +1,357 @@
+"""What the synthetic people do, and the words for it: household movements with directions, heights and named arms.
+
+Each activity adds to a `Script` and returns interchangeable phrases. Wrist points are in the base frame: x forward, y left, z above
+the floor, metres.
+
+Paper: none; part of the generator of motions. The vocabulary follows HumanML3D's manner of describing motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.script import Script
+
+__all__ = ["ACTIVITIES", "HEIGHTS", "RECIPES"]
+
+Array = NDArray[np.float64]
+Phrases = list[str]
+Activity = Callable[[Script], Phrases]
+
+#: Height bands (m above the floor) and their names.
+HEIGHTS: Final[Mapping[str, tuple[float, float]]] = {
+    "near the floor": (0.15, 0.35),
+    "at knee height": (0.45, 0.6),
+    "at waist height": (0.8, 1.05),
+    "at chest height": (1.15, 1.35),
+    "at head height": (1.45, 1.6),
+    "above the head": (1.7, 1.85),
+}
+_SIDES: Final = ("left", "right")
+
+
+def _choice(script: Script, options: tuple[str, ...] | list[str]) -> str:
+    return str(options[int(script.rng.integers(len(options)))])
+
+
+def _point(script: Script, side: int, height: str, width: float | None = None) -> Array:
+    low, high = HEIGHTS[height]
+    x = 0.22 if height == "above the head" else float(script.rng.uniform(0.34, 0.44))
+    y = float(script.rng.uniform(0.1, 0.3)) if width is None else width
+    return np.array([x, y if side == 0 else -y, script.rng.uniform(low, high)])
+
+
+def _go(script: Script, wrists: dict[int, Array], seconds: float) -> None:
+    drop, lean = script.reach_posture(list(wrists.values()))
+    for side, wrist in wrists.items():
+        script.hand(side, wrist, seconds, advance=False)
+    script.posture(drop, lean, seconds)
+
+
+def _stand(script: Script, seconds: float) -> None:
+    script.posture(0.0, 0.03, seconds)
+
+
+def _slow(script: Script, wrists: dict[int, Array]) -> float:
+    """Seconds for a reach: low ones take longer."""
+    lowest = min(float(wrist[2]) for wrist in wrists.values())
+    return float(script.rng.uniform(0.8, 1.1) + (0.5 if lowest < 0.65 else 0.0))
+
+
+def walk(script: Script) -> Phrases:
+    """Walks ahead, at one of three paces, straight or along a curve."""
+    pace, word = [(0.8, "slowly"), (1.0, ""), (1.15, "quickly")][int(script.rng.integers(3))]
+    turn = float(script.rng.choice([0.0, 0.0, 0.9, -0.9]))
+    script.walk(float(script.rng.uniform(0.8, 2.4)), turn_rad=turn, pace=pace)
+    curve = "" if turn == 0.0 else f" in a curve to the {_SIDES[int(turn < 0)]}"
+    word = f" {word}" if word else ""
+    return [f"walks forward{word}{curve}", f"takes a few steps ahead{word}{curve}", f"moves forward{word}{curve}"]
+
+
+def walk_back(script: Script) -> Phrases:
+    """Walks backwards."""
+    script.walk(float(script.rng.uniform(0.4, 0.9)), direction_rad=np.pi, pace=0.9)
+    return ["walks backwards", "takes a few steps back", "steps backward"]
+
+
+def turn(script: Script) -> Phrases:
+    """Turns in place by 45 to 180 degrees."""
+    degrees = int(script.rng.choice([45, 90, 135, 180]))
+    side = int(script.rng.integers(2))
+    script.walk(0.0, turn_rad=np.deg2rad(degrees) * (1 if side == 0 else -1))
+    name = _SIDES[side]
+    around = "turns around" if degrees == 180 else f"turns {degrees} degrees"
+    return [f"{around} to the {name}", f"turns to the {name}", f"rotates {name} in place"]
+
+
+def side_step(script: Script) -> Phrases:
+    """Steps sideways."""
+    side = int(script.rng.integers(2))
+    script.walk(float(script.rng.uniform(0.3, 0.8)), direction_rad=np.pi / 2 * (1 if side == 0 else -1))
+    name = _SIDES[side]
+    return [f"steps sideways to the {name}", f"side-steps {name}", f"moves to the {name} without turning"]
+
+
+def crouch(script: Script) -> Phrases:
+    """Crouches and rises."""
+    drop = float(script.rng.uniform(0.15, 0.36))
+    script.posture(drop, 0.9 * drop + 0.1, float(script.rng.uniform(0.8, 1.3)))
+    script.wait(float(script.rng.uniform(0.2, 0.7)))
+    _stand(script, float(script.rng.uniform(0.8, 1.2)))
+    deep = "deeply" if drop > 0.27 else "slightly"
+    return [f"crouches {deep} and rises again", f"bends the knees {deep} and stands up", f"squats {deep}, then straightens up"]
+
+
+def bend(script: Script) -> Phrases:
+    """Bends the trunk forward and straightens."""
+    lean = float(script.rng.uniform(0.4, 0.95))
+    script.posture(0.02, lean, float(script.rng.uniform(0.8, 1.2)))
+    script.wait(float(script.rng.uniform(0.2, 0.6)))
+    _stand(script, float(script.rng.uniform(0.8, 1.1)))
+    return ["bends forward and straightens up", "leans forward at the waist and comes back up", "bows and stands upright again"]
+
+
+def idle(script: Script) -> Phrases:
+    """Stands still."""
+    script.wait(float(script.rng.uniform(1.5, 3.0)))
+    return ["stands still", "waits without moving", "remains standing with the arms at the sides"]
+
+
+def reach(script: Script) -> Phrases:
+    """Reaches out with one arm and takes the hand back."""
+    side, height = int(script.rng.integers(2)), _choice(script, list(HEIGHTS))
+    wrists = {side: _point(script, side, height)}
+    script.grip(side, 1.0)
+    seconds = _slow(script, wrists)
+    _go(script, wrists, seconds)
+    script.wait(float(script.rng.uniform(0.2, 0.5)))
+    script.hand(side, None, seconds, advance=False)
+    _stand(script, seconds)
+    name = _SIDES[side]
+    return [
+        f"reaches out with the {name} hand {height}",
+        f"extends the {name} arm {height} and brings it back",
+        f"stretches the {name} arm forward {height}",
+    ]
+
+
+def reach_both(script: Script) -> Phrases:
+    """Reaches out with both arms and takes the hands back."""
+    height = _choice(script, list(HEIGHTS))
+    width = float(script.rng.uniform(0.12, 0.3))
+    left = _point(script, 0, height, width)
+    wrists = {0: left, 1: left * np.array([1.0, -1.0, 1.0])}
+    for side in (0, 1):
+        script.grip(side, 1.0)
+    seconds = _slow(script, wrists)
+    _go(script, wrists, seconds)
+    script.wait(float(script.rng.uniform(0.2, 0.5)))
+    for side in (0, 1):
+        script.hand(side, None, seconds, advance=False)
+    _stand(script, seconds)
+    return [
+        f"reaches out with both hands {height}",
+        f"extends both arms {height} and lowers them",
+        f"stretches both arms forward {height}",
+    ]
+
+
+def pick(script: Script) -> Phrases:
+    """Picks something up with one hand and holds it."""
+    side, height = int(script.rng.integers(2)), _choice(script, list(HEIGHTS)[:5])
+    wrists = {side: _point(script, side, height)}
+    script.grip(side, 1.0)
+    seconds = _slow(script, wrists)
+    _go(script, wrists, seconds)
+    script.grip(side, 0.1)
+    script.wait(0.35)
+    script.hand(side, np.array([0.28, 0.2 if side == 0 else -0.2, 1.1]), seconds, advance=False)
+    _stand(script, seconds)
+    name, thing = _SIDES[side], _choice(script, ("a cup", "a bottle", "an object", "a small box"))
+    return [
+        f"picks up {thing} {height} with the {name} hand",
+        f"grabs {thing} {height} using the {name} arm",
+        f"takes {thing} {height} in the {name} hand and holds it",
+    ]
+
+
+def place(script: Script) -> Phrases:
+    """Puts down what one hand holds."""
+    side, height = int(script.rng.integers(2)), _choice(script, list(HEIGHTS)[1:5])
+    script.grip(side, 0.1)
+    script.hand(side, np.array([0.28, 0.2 if side == 0 else -0.2, 1.1]), 0.7)
+    wrists = {side: _point(script, side, height)}
+    seconds = _slow(script, wrists)
+    _go(script, wrists, seconds)
+    script.grip(side, 1.0)
+    script.wait(0.35)
+    script.hand(side, None, seconds, advance=False)
+    _stand(script, seconds)
+    name, thing = _SIDES[side], _choice(script, ("a cup", "a plate", "an object", "a book"))
+    return [
+        f"puts down {thing} {height} with the {name} hand",
+        f"places {thing} {height} using the {name} arm",
+        f"sets {thing} down {height} with the {name} hand",
+    ]
+
+
+def carry(script: Script) -> Phrases:
+    """Carries something in front of the body with both hands."""
+    for side in (0, 1):
+        script.grip(side, 0.3)
+        wrist = np.array([0.32, 0.16 if side == 0 else -0.16, 1.08])
+        script.hand(side, wrist, 0.8, advance=side == 1)
+    script.walk(float(script.rng.uniform(0.8, 1.8)), pace=0.9)
+    thing = _choice(script, ("a box", "a pot", "a tray"))
+    return [
+        f"carries {thing} forward with both hands",
+        f"walks ahead while holding {thing} in both hands",
+        f"moves {thing} with both arms",
+    ]
+
+
+def lift(script: Script) -> Phrases:
+    """Lifts something with both hands."""
+    height = _choice(script, list(HEIGHTS)[:3])
+    left = _point(script, 0, height, float(script.rng.uniform(0.14, 0.24)))
+    wrists = {0: left, 1: left * np.array([1.0, -1.0, 1.0])}
+    for side in (0, 1):
+        script.grip(side, 0.9)
+    seconds = _slow(script, wrists)
+    _go(script, wrists, seconds)
+    for side in (0, 1):
+        script.grip(side, 0.3)
+    script.wait(0.35)
+    for side in (0, 1):
+        script.hand(side, np.array([0.33, left[1] if side == 0 else -left[1], 1.12]), seconds, advance=False)
+    _stand(script, seconds)
+    thing = _choice(script, ("a box", "a heavy object", "a pot", "a basket"))
+    return [
+        f"lifts {thing} {height} with both hands",
+        f"picks up {thing} {height} using both arms",
+        f"raises {thing} from {height[3:] if height.startswith('at ') else 'the floor'} with two hands",
+    ]
+
+
+def _along(script: Script, side: int, start_x: float, end_x: float) -> str:
+    height = _choice(script, ["at waist height", "at chest height"])
+    first = _point(script, side, height, 0.18)
+    first[0] = start_x
+    last = first.copy()
+    last[0] = end_x
+    _go(script, {side: first}, float(script.rng.uniform(0.7, 1.0)))
+    script.grip(side, 0.2)
+    script.wait(0.25)
+    _go(script, {side: last}, float(script.rng.uniform(0.9, 1.3)))
+    script.grip(side, 0.6)
+    script.wait(0.25)
+    script.hand(side, None, 0.9, advance=False)
+    _stand(script, 0.9)
+    return height
+
+
+def push(script: Script) -> Phrases:
+    """Pushes with one hand."""
+    side = int(script.rng.integers(2))
+    height = _along(script, side, 0.24, 0.5)
+    return [
+        f"pushes something away with the {_SIDES[side]} hand {height}",
+        f"pushes forward {height} using the {_SIDES[side]} arm",
+    ]
+
+
+def pull(script: Script) -> Phrases:
+    """Pulls with one hand."""
+    side = int(script.rng.integers(2))
+    height = _along(script, side, 0.5, 0.24)
+    return [
+        f"pulls something closer with the {_SIDES[side]} hand {height}",
+        f"pulls a drawer out {height} using the {_SIDES[side]} arm",
+    ]
+
+
+def open_door(script: Script) -> Phrases:
+    """Swings a door open: the hand follows an arc about a hinge on its own side."""
+    side = int(script.rng.integers(2))
+    sign = 1.0 if side == 0 else -1.0
+    height = _choice(script, ["at waist height", "at chest height"])
+    z = float(script.rng.uniform(*HEIGHTS[height]))
+    hinge, radius = np.array([0.5, 0.42 * sign]), 0.4
+    script.grip(side, 1.0)
+    arc = [np.array([hinge[0] - radius * np.sin(a), hinge[1] - sign * radius * np.cos(a), z]) for a in np.linspace(0.0, 0.8, 5)]
+    _go(script, {side: arc[0]}, float(script.rng.uniform(0.8, 1.1)))
+    script.grip(side, 0.1)
+    script.wait(0.3)
+    start = script.time_s
+    total = float(script.rng.uniform(1.1, 1.6))
+    script.hand_path(side, arc, total)
+    script.time_s = start + total
+    script.grip(side, 0.7)
+    script.wait(0.2)
+    script.hand(side, None, 0.9, advance=False)
+    _stand(script, 0.9)
+    name, thing = _SIDES[side], _choice(script, ("a cabinet door", "a fridge", "a cupboard"))
+    return [f"opens {thing} with the {name} hand", f"pulls {thing} open {height} with the {name} hand"]
+
+
+def wave(script: Script) -> Phrases:
+    """Waves with a raised hand."""
+    side = int(script.rng.integers(2))
+    sign = 1.0 if side == 0 else -1.0
+    script.grip(side, 1.0)
+    centre = np.array([0.2, 0.36 * sign, 1.62])
+    script.hand(side, centre, 0.8)
+    for _ in range(int(script.rng.integers(2, 4))):
+        for shift in (0.12, -0.12):
+            script.hand(side, centre + np.array([0.0, shift * sign, -0.02]), 0.3)
+    script.hand(side, None, 0.9)
+    name = _SIDES[side]
+    return [f"waves with the {name} hand", f"raises the {name} arm and waves", f"greets by waving the {name} hand"]
+
+
+ACTIVITIES: Final[Mapping[str, Activity]] = {
+    "walk": walk,
+    "walk_back": walk_back,
+    "turn": turn,
+    "side_step": side_step,
+    "crouch": crouch,
+    "bend": bend,
+    "idle": idle,
+    "reach": reach,
+    "reach_both": reach_both,
+    "pick": pick,
+    "place": place,
+    "carry": carry,
+    "lift": lift,
+    "push": push,
+    "pull": pull,
+    "open": open_door,
+    "wave": wave,
+}
+#: Sequences that make sense together, besides each activity alone.
+RECIPES: Final[tuple[tuple[str, ...], ...]] = (
+    *((name,) for name in ACTIVITIES),
+    ("walk", "reach"),
+    ("walk", "pick"),
+    ("turn", "walk"),
+    ("walk", "turn"),
+    ("pick", "walk"),
+    ("pick", "turn"),
+    ("lift", "turn"),
+    ("carry", "turn"),
+    ("side_step", "reach"),
+    ("turn", "reach_both"),
+    ("walk", "open"),
+    ("walk", "place"),
+    ("side_step", "place"),
+    ("walk", "wave"),
+    ("walk_back", "turn"),
+    ("crouch", "walk"),
+    ("reach", "reach_both"),
+    ("turn", "push"),
+    ("pull", "walk_back"),
+)

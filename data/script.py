@@ -1,0 +1,228 @@
+"""A timeline on which a synthetic person walks, turns, crouches and uses both hands; it becomes a posed skeleton.
+
+Values move along minimum-jerk curves. Steps are planned first and stance feet do not move, so that contacts are real: the body
+follows its path, each foot swings to where the body will be and stays there until its next step.
+Axes: x forward, y left, z up. Sides: 0 left, 1 right.
+
+Paper: none; part of the generator of motions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.posing import ANKLE_HEIGHT_M, ARM_LENGTH_M, FOOT_SPREAD_M, STANDING_HEIGHT_M, Channels, pose
+
+__all__ = ["HANG", "Script", "minimum_jerk"]
+
+Array = NDArray[np.float64]
+#: Left wrist hanging at the side, in the base frame.
+HANG: Final = np.array([0.04, 0.235, 0.91])
+_MIRROR: Final = np.array([1.0, -1.0, 1.0])
+_TOE_OUT_RAD: Final = 0.12
+_SWING_HEIGHT_M: Final = 0.075
+
+
+def minimum_jerk(u: Array) -> Array:
+    """Minimum-jerk progress for u in [0, 1]: 10 u^3 - 15 u^4 + 6 u^5."""
+    u = np.clip(u, 0.0, 1.0)
+    return u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
+
+
+@dataclass
+class Track:
+    """A value over time: keys joined by minimum-jerk curves."""
+
+    value: Array
+    keys: list[tuple[float, float, Array, Array]] = field(default_factory=list)
+
+    def move(self, start_s: float, end_s: float, value: Array) -> None:
+        """Moves from the current value to `value` between two times."""
+        self.keys.append((start_s, end_s, self.value, np.asarray(value, dtype=float)))
+        self.value = np.asarray(value, dtype=float)
+
+    def sample(self, times: Array) -> Array:
+        """(T, N) values."""
+        first = self.keys[0][2] if self.keys else self.value
+        out = np.tile(first, (len(times), 1))
+        for start, end, before, after in self.keys:
+            u = minimum_jerk((times - start) / max(end - start, 1e-6))[:, None]
+            out = np.where((times >= start)[:, None], before + u * (after - before), out)
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Walk:
+    start_s: float
+    step_s: float
+    steps: int
+    distance_m: float
+    direction_rad: float
+    turn_rad: float
+    first_foot: int
+
+
+class Script:
+    """Collects what happens; `time_s` is the end of what has been said so far."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.time_s = float(rng.uniform(0.1, 0.4))
+        self._height = Track(np.array([STANDING_HEIGHT_M + rng.uniform(-0.02, 0.01)]))
+        self._standing = float(self._height.value[0])
+        self._lean = Track(np.array([rng.uniform(0.0, 0.06)]))
+        self._hands = [Track(HANG.copy()), Track(HANG * _MIRROR)]
+        self._free = [Track(np.ones(1)), Track(np.ones(1))]
+        self._opening = [Track(np.array([0.6])), Track(np.array([0.6]))]
+        self._walks: list[_Walk] = []
+
+    def wait(self, seconds: float) -> None:
+        """Nothing new happens for a while."""
+        self.time_s += seconds
+
+    def walk(self, distance_m: float, direction_rad: float = 0.0, turn_rad: float = 0.0, pace: float = 1.0) -> None:
+        """Steps along a direction relative to the heading (0 ahead), turning on the way; `pace` stretches or shortens steps."""
+        stride = 0.37 if abs(np.cos(direction_rad)) > 0.7 else 0.25
+        steps = max(2, int(np.ceil(max(distance_m / stride, abs(turn_rad) / 0.55))))
+        first = int(self.rng.integers(2))
+        if abs(turn_rad) > 0.2:
+            first = 0 if turn_rad > 0 else 1
+        elif abs(np.sin(direction_rad)) > 0.7:
+            first = 0 if np.sin(direction_rad) > 0 else 1
+        walk = _Walk(self.time_s, 0.56 / pace, steps, distance_m, direction_rad, turn_rad, first)
+        self._walks.append(walk)
+        self.time_s += walk.step_s * (steps + 1)
+
+    def posture(self, drop_m: float, lean_rad: float, seconds: float, advance: bool = True) -> None:
+        """Lowers the pelvis by `drop_m` below standing and leans the trunk."""
+        end = self.time_s + seconds
+        self._height.move(self.time_s, end, np.array([self._standing - drop_m]))
+        self._lean.move(self.time_s, end, np.array([lean_rad]))
+        if advance:
+            self.time_s = end
+
+    def hand(self, side: int, wrist: Array | None, seconds: float, advance: bool = True) -> None:
+        """Moves one wrist to a point of the base frame, or lets it hang (None)."""
+        end = self.time_s + seconds
+        target = (HANG if side == 0 else HANG * _MIRROR) if wrist is None else wrist
+        self._hands[side].move(self.time_s, end, target)
+        self._free[side].move(self.time_s, end, np.array([float(wrist is None)]))
+        if advance:
+            self.time_s = end
+
+    def hand_path(self, side: int, wrists: list[Array], seconds: float) -> None:
+        """Moves one wrist through points of the base frame in one minimum-jerk sweep; time does not advance."""
+        share = np.linspace(0.0, 1.0, 13)
+        places = minimum_jerk(share) * (len(wrists) - 1)
+        points = np.stack([np.interp(places, np.arange(len(wrists)), np.array(wrists)[:, axis]) for axis in range(3)], axis=1)
+        for k in range(1, len(share)):
+            track = self._hands[side]
+            track.keys.append(
+                (self.time_s + share[k - 1] * seconds, self.time_s + share[k] * seconds, points[k - 1], points[k])
+            )
+            track.value = points[k]
+
+    def grip(self, side: int, opening: float, seconds: float = 0.3) -> None:
+        """Opens (1) or closes (0) one hand while time goes on elsewhere."""
+        self._opening[side].move(self.time_s, self.time_s + seconds, np.array([opening]))
+
+    def reach_posture(self, wrists: list[Array]) -> tuple[float, float]:
+        """Smallest drop (m) and lean (rad) with which the shoulders reach all wrists."""
+        best, choice = np.inf, (0.42, 1.0)
+        for lean in np.arange(0.0, 1.25, 0.1):
+            for drop in np.arange(0.0, 0.43, 0.06):
+                forward = 0.21 * np.sin(lean) + 0.105 * np.sin(0.35 * lean) - 0.025
+                shoulder = np.array([forward, 0.0, self._standing - drop + 0.105 * np.cos(0.35 * lean) + 0.37 * np.cos(lean)])
+                away = max(
+                    float(np.linalg.norm(wrist - shoulder - np.array([0.0, 0.18 * np.sign(wrist[1]), 0.0]))) for wrist in wrists
+                )
+                cost = lean + 2.0 * drop + 40.0 * max(0.0, away - 0.94 * ARM_LENGTH_M)
+                if cost < best:
+                    best, choice = cost, (float(drop), float(lean))
+        return choice
+
+    def render(self, fps: float) -> tuple[Array, Array]:
+        """Joint positions (T, 22, 3) and hand opening (T, 2) up to the current time."""
+        times = np.arange(int(np.ceil(self.time_s * fps)) + 1) / fps
+        base, feet, swing = self._locomotion(times)
+        lean = self._lean.sample(times)[:, 0]
+        height = self._height.sample(times)[:, 0]
+        # Hanging hands go with the shoulders.
+        sink = height - self._standing + 0.37 * (np.cos(lean) - 1.0)
+        carried = np.column_stack([0.21 * np.sin(lean) + 0.1 * np.sin(0.35 * lean), np.zeros_like(lean), sink])
+        hands = np.stack([track.sample(times) for track in self._hands], axis=1)
+        free = np.stack([track.sample(times) for track in self._free], axis=1)
+        hands += free * carried[:, None]
+        hands[:, :, 0] += free[:, :, 0] * swing
+        hands[:, :, 2] += free[:, :, 0] * 0.25 * np.abs(swing)
+        opening = np.concatenate([track.sample(times) for track in self._opening], axis=1)
+        return pose(Channels(base, height, lean, feet, hands)), opening
+
+    def _locomotion(self, times: Array) -> tuple[Array, Array, Array]:
+        base = np.zeros((len(times), 3))
+        swing = np.zeros((len(times), 2))
+        place = np.zeros(3)
+        feet = [Track(_foot(place, side)) for side in (0, 1)]
+        lift = np.zeros((len(times), 2))
+        for walk in self._walks:
+            duration = walk.step_s * walk.steps
+            start, path = place.copy(), _path(walk, place)
+            for step in range(walk.steps + 1):
+                side = (walk.first_foot + step) % 2
+                begin = walk.start_s + step * walk.step_s
+                landing = path(min((step + 1.5) * walk.step_s / duration, 1.0))
+                feet[side].move(begin + 0.08 * walk.step_s, begin + 0.86 * walk.step_s, _foot(landing, side))
+                u = np.clip((times - begin - 0.08 * walk.step_s) / (0.78 * walk.step_s), 0.0, 1.0)
+                lift[:, side] += _SWING_HEIGHT_M * np.sin(np.pi * u) ** 2
+                now = (times >= begin) & (times < begin + walk.step_s)
+                phase = np.cos(np.pi * (times[now] - begin) / walk.step_s)
+                width = 0.42 * (walk.distance_m / duration) * max(np.cos(walk.direction_rad), 0.0) * walk.step_s
+                fade = 0.5 if step in (0, walk.steps) else 1.0
+                swing[now, 1 - side] -= fade * width * phase
+                swing[now, side] += fade * width * phase
+            place = path(1.0)
+            inside = times >= walk.start_s
+            base[inside] = [path(float(np.clip((t - walk.start_s) / duration, 0.0, 1.0))) for t in times[inside]]
+            assert np.allclose(path(0.0), start)
+        tracks = np.stack([track.sample(times) for track in feet], axis=1)
+        tracks[:, :, 2] += lift
+        return base, tracks, _smooth(swing)
+
+
+def _foot(place: Array, side: int) -> Array:
+    sign = 1.0 if side == 0 else -1.0
+    x, y, yaw = place
+    return np.array(
+        [
+            x - sign * FOOT_SPREAD_M * np.sin(yaw) - 0.03 * np.cos(yaw),
+            y + sign * FOOT_SPREAD_M * np.cos(yaw) - 0.03 * np.sin(yaw),
+            ANKLE_HEIGHT_M,
+            yaw + sign * _TOE_OUT_RAD,
+        ]
+    )
+
+
+def _path(walk: _Walk, start: Array):  # noqa: ANN202 - a small closure
+    """Place (x, y, yaw) along a walk for progress u in [0, 1], with soft ends."""
+    grid = np.linspace(0.0, 1.0, 65)
+    ramp = min(0.3, 0.6 / walk.steps)
+    speed = np.clip(np.minimum(grid, 1.0 - grid) / ramp, 0.0, 1.0)
+    speed = speed * speed * (3.0 - 2.0 * speed)
+    progress = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))])
+    progress /= progress[-1]
+    yaw = start[2] + walk.turn_rad * progress
+    middle = 0.5 * (yaw[1:] + yaw[:-1]) + walk.direction_rad
+    step = np.diff(progress) * walk.distance_m
+    x = start[0] + np.concatenate([[0.0], np.cumsum(step * np.cos(middle))])
+    y = start[1] + np.concatenate([[0.0], np.cumsum(step * np.sin(middle))])
+    return lambda u: np.array([np.interp(u, grid, x), np.interp(u, grid, y), np.interp(u, grid, yaw)])
+
+
+def _smooth(values: Array) -> Array:
+    kernel = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9.0
+    padded = np.pad(values, ((2, 2), (0, 0)), mode="edge")
+    return np.stack([np.convolve(padded[:, i], kernel, mode="valid") for i in range(values.shape[1])], axis=1)
