@@ -15,6 +15,8 @@ from tokenizers import Regex, Tokenizer, decoders, models, normalizers, pre_toke
 from transformers import AddedToken, Qwen2Tokenizer
 from transformers.models.qwen2.tokenization_qwen2 import PRETOKENIZE_REGEX
 
+from data.records import ACTIONS
+
 __all__ = ["ID_SUFFIXES", "SPECIAL_TOKENS", "train_tokenizer"]
 
 #: Qwen's special tokens, in its order.
@@ -43,22 +45,23 @@ def train_tokenizer(texts: Iterable[str], vocab_size: int, whole_words: Sequence
     """Trains a tokenizer.
 
     Args:
-        texts: the text to learn merges from.
+        texts: the text to learn merges from; rendered conversations are fine, special and motion tokens are left out.
         vocab_size: most entries of the result, special tokens and whole words included; at least 256 bytes plus those.
         whole_words: words that are one token wherever they stand, such as object type names: a name then has the same
-            embedding after a space, a bracket or another name. The longest match wins.
+            embedding after a space, a bracket or another name. The longest match wins. Action names are always among them.
 
     Raises:
         ValueError: when `vocab_size` is too small, or a whole word is not of letters, digits and underscores.
     """
-    words = tuple(dict.fromkeys((*whole_words, *ID_SUFFIXES)))
+    words = tuple(dict.fromkeys((*whole_words, *ACTIONS, *ID_SUFFIXES)))
     for word in words:
         if not _WORD.match(word):
             raise ValueError(f"whole word {word!r}: allowed are letters, digits and underscores")
     size = vocab_size - len(SPECIAL_TOKENS) - len(words)
     if size < 256:
         raise ValueError(f"vocab_size {vocab_size} too small; at least {256 + len(SPECIAL_TOKENS) + len(words)} needed")
-    splitter = re.compile("|".join(re.escape(word) for word in sorted(words, key=len, reverse=True)))
+    fixed = sorted((*words, *SPECIAL_TOKENS), key=len, reverse=True)
+    splitter = re.compile("|".join((r"<motion_\w+>", *(re.escape(word) for word in fixed))))
     trained = Tokenizer(models.BPE())
     trained.normalizer = normalizers.NFC()
     trained.pre_tokenizer = pre_tokenizers.Sequence(

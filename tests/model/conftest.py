@@ -44,7 +44,7 @@ def one_thread() -> None:
 def cfg() -> ModelConfig:
     return ModelConfig(
         name="test",
-        vocab_size=340,
+        vocab_size=380,
         text=TinyTextConfig(hidden=64, layers=2, heads=2, kv_heads=1, intermediate=96),
         vision=TinyVisionConfig(hidden=32, depth=2, heads=2, intermediate=48),
         lora=LoraConfig(rank=4, alpha=8),
@@ -57,7 +57,7 @@ def cfg() -> ModelConfig:
 
 @pytest.fixture(scope="session")
 def processor() -> ProprioProcessor:
-    cfg = ModelConfig(name="test", vocab_size=340, motion=MotionTokenizerConfig(codes=16))
+    cfg = ModelConfig(name="test", vocab_size=380, motion=MotionTokenizerConfig(codes=16))
     return build_processor(cfg, TEXTS, TYPES)
 
 

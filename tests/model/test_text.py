@@ -23,7 +23,7 @@ def _pieces(processor, text):
 
 def test_whole_words_are_one_token_everywhere_and_the_longest_wins(processor):
     assert _pieces(processor, "Mug_1CoffeeMachine_12Pancake_2") == ["Mug", "_1", "CoffeeMachine", "_1", "2", "Pancake", "_2"]
-    assert _pieces(processor, "(Mug_1)")[1:3] == ["Mug", "_1"]
+    assert _pieces(processor, "Pick(Mug_1)") == ["Pick", "(", "Mug", "_1", ")"]
     assert _pieces(processor, "<motion_start><motion_1><motion_15>") == ["<motion_start>", "<motion_1>", "<motion_15>"]
 
 
@@ -40,6 +40,12 @@ def test_special_tokens_are_qwens_and_unbroken(processor):
         assert _pieces(processor, token) == [token]
     assert processor.tokenizer.eos_token == "<|im_end|>"
     assert processor.tokenizer.decode(processor.tokenizer("<|im_end|>")["input_ids"], skip_special_tokens=True) == ""
+
+
+def test_action_names_are_one_token_and_markup_teaches_no_merges():
+    tokenizer = train_tokenizer(["<|im_start|>ab<motion_start><motion_1>ab<|im_end|>GoTo(PlaceBoth)"] * 9, 400)
+    pieces = tokenizer.convert_ids_to_tokens(tokenizer("GoToPlaceBoth ab im_start")["input_ids"])
+    assert pieces == ["GoTo", "PlaceBoth", "Ġ", "ab", "Ġ", "i", "m", "_", "s", "t", "a", "r", "t"]
 
 
 def test_tokenizer_arguments_are_checked():
