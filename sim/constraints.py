@@ -1,9 +1,9 @@
 """Grasp constraints: what makes an object follow the hand once contact has justified it.
 
 Every arm has one weld (objects) and one ball joint (handles of doors and drawers). They are pointed at a body at run time by
-writing `eq_obj2id` and `eq_data`, which MuJoCo reads at every step. A held body no longer touches the hands, which keeps the contact
-count and the internal forces small; after release it touches them again as soon as nothing overlaps. Paper: grasps of DualTHOR,
-which need no contact there.
+writing `eq_obj2id` and `eq_data`, which MuJoCo reads at every step. A held body no longer touches the hands, which keeps the
+contact count and the internal forces small; after release it touches them again as soon as nothing overlaps. Paper: grasps of
+DualTHOR, which need no contact there.
 """
 
 from __future__ import annotations

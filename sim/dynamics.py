@@ -1,7 +1,8 @@
 """What changes by itself besides rigid bodies: heat, filling under a tap, breakage by impact, and how states look.
 
 Simple laws on purpose: a temperature approaches that of its surroundings exponentially, a vessel below a running tap fills, a
-breakable object that stops from more than 2.6 m/s (a fall of 0.35 m) within one recorder frame breaks. Paper: state changes of DualTHOR.
+breakable object that stops from more than 2.6 m/s (a fall of 0.35 m) within one recorder frame breaks. Paper: state changes of
+DualTHOR.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ def look(world: World, thing: ObjectInstance) -> None:
                 rgba = np.array(colors["maroon"]) if state.fillLiquid == "wine" else np.array([0.30, 0.55, 0.95, 0.9])
         elif "glow" in part.options:
             if state.isToggled:
-                rgba = np.array(colors.get(f"{part.color}_on", part and colors[part.color]), dtype=float)
+                rgba = np.array(colors.get(f"{part.color}_on", colors[part.color]), dtype=float)
             elif "hidden" in part.options:
                 rgba[3] = 0.0
             material = int(model.geom_matid[geom])

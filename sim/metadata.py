@@ -1,7 +1,7 @@
 """AI2-THOR-style metadata of a world: one record per object, and the robot's.
 
 Paper: the scene state that DualTHOR returns. Frames: MuJoCo's (z up, metres); AI2-THOR's y-up frame is not used. Key names are
-AI2-THOR's, plus `heldBy` (arms that hold the object) and `brokenPieces`-free breakage.
+AI2-THOR's, plus `heldBy` (arms that hold the object), `center` and `temperatureCelsius`.
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ def world_metadata(world: World) -> dict[str, Any]:
         for parent in above:
             contents.setdefault(parent, []).append(name)
     objects = [
-        object_metadata(world, thing, parents.get(name, ()), tuple(contents.get(name, ()))) for name, thing in world.objects.items()
+        object_metadata(world, thing, parents.get(name, ()), tuple(contents.get(name, ())))
+        for name, thing in world.objects.items()
     ]
     x0, y0, x1, y1 = world.room.bounds
     record: dict[str, Any] = {

@@ -1,7 +1,7 @@
 """Objects of a scene: what belongs to one id in the MuJoCo model, and its state under AI2-THOR's names.
 
-Paper: object states of DualTHOR. Positions, openness and containment are read from physics; what physics does not know (toggled,
-filled, dirty, cooked, broken, temperature) is kept here and shown by colours.
+Paper: object states of DualTHOR. Positions, openness and containment are read from physics; what physics does not know
+(toggled, filled, dirty, cooked, broken, temperature) is kept here and shown by colours.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ class Placement(Protocol):
     """One movable object to put into a room; `sim.tasks.task.Placement` has this shape."""
 
     @property
-    def object_id(self) -> str: ...  # noqa: D102
+    def object_id(self) -> str: ...
     @property
-    def receptacle(self) -> str: ...  # noqa: D102
+    def receptacle(self) -> str: ...
     @property
-    def xy(self) -> tuple[float, float] | None: ...  # noqa: D102
+    def xy(self) -> tuple[float, float] | None: ...
     @property
-    def yaw_deg(self) -> float: ...  # noqa: D102
+    def yaw_deg(self) -> float: ...
     @property
-    def state(self) -> Mapping[str, bool | float | str]: ...  # noqa: D102
+    def state(self) -> Mapping[str, bool | float | str]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class ObjectState:
         temperature: degrees Celsius.
     """
 
-    isToggled: bool = False  # noqa: N815 AI2-THOR's names
+    isToggled: bool = False  # noqa: N815
     isBroken: bool = False  # noqa: N815
     isFilledWithLiquid: bool = False  # noqa: N815
     fillLiquid: str = ""  # noqa: N815
@@ -111,7 +111,7 @@ class MovingPart:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """A supporting surface and the body it belongs to; `spec` is given in the type's frame, `origin` is the body's origin there."""
+    """A supporting surface and its body; `spec` is given in the type's frame, `origin` is the body's origin there."""
 
     spec: SurfaceSpec
     body_id: int

@@ -152,7 +152,10 @@ def resting_on(data: mujoco.MjData, objects: Mapping[str, ObjectInstance]) -> di
         for receptacle, surface in surfaces:
             if receptacle is thing:
                 continue
-            if abs(data.xpos[receptacle.body_id, 0] - bottom[0]) > 1.6 or abs(data.xpos[receptacle.body_id, 1] - bottom[1]) > 1.6:
+            if (
+                abs(data.xpos[receptacle.body_id, 0] - bottom[0]) > 1.6
+                or abs(data.xpos[receptacle.body_id, 1] - bottom[1]) > 1.6
+            ):
                 continue
             x, y, z = _to_surface(data, surface, bottom)
             cx, cy, sx, sy = surface.spec.rect

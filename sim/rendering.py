@@ -1,8 +1,8 @@
 """Offscreen pictures of a world: RGB, metric depth and instance segmentation of one camera at one size.
 
 The OpenGL backend is chosen in `sim.gl`: EGL unless MUJOCO_GL says otherwise, OSMesa where EGL is missing.
-Planner images have no shadows, reflections or multisampling (measured on two shared CPU cores: 10 x and 3 x). Paper: first-person
-and third-person cameras of DualTHOR. Left out: camera noise and lens distortion.
+Planner images have no shadows, reflections or multisampling (measured on two shared CPU cores: 10 x and 3 x). Paper:
+first-person and third-person cameras of DualTHOR. Left out: camera noise and lens distortion.
 
 Camera frame: x right, y down, z forward. Shape letters: H rows, W columns.
 """
@@ -36,7 +36,8 @@ class View:
     Attributes:
         rgb: (H, W, 3) uint8.
         depth: (H, W) float32 metres along the optical axis, or None.
-        segmentation: (H, W) int32, index into `World.objects` in their order, -1 for none (walls, floor, sky), -2 for the robot; or None.
+        segmentation: (H, W) int32, index into `World.objects` in their order, -1 for walls, floor and sky, -2 for the
+            robot; or None.
         intrinsics: (3, 3) K in pixels.
         camera_in_world: (4, 4) pose of the camera (x right, y down, z forward).
     """

@@ -2,11 +2,12 @@
 
 The scene grows out of the robot's MJCF, whose free joint is replaced by five position-servoed joints (`base_x`, `base_y`,
 `base_z`, `base_yaw`, and `base_pitch`, the forward lean of a deep crouch), because the base moves along planned free paths.
-Furniture is static, with joints for doors and drawers; movable objects have free joints. Each arm owns one weld and one ball (connect) constraint that are inactive until a grasp points them at
+Furniture is static, with joints for doors and drawers; movable objects have free joints. Each arm owns one weld and one ball
+(connect) constraint that are inactive until a grasp points them at
 a body (`World.attach`). Paper: the DualTHOR scenes; balance control and cloth-like or liquid bodies are left out.
 
-Collision bits (`contype`/`conaffinity`), so that only pairs that matter are tested: static 1/0, movable 2/23, hands and forearms
-4/3 (set in the robot's MJCF), held object 8/27, held door or drawer 16/0. Static geometry, doors, trunk and legs never meet
+Collision bits (`contype`/`conaffinity`), so that only pairs that matter are tested: static 1/0, movable 2/23, hands and
+forearms 4/3 (set in the robot's MJCF), held object 8/27, held door or drawer 16/0. Static geometry, doors, trunk and legs never meet
 each other; a held object or door does not meet the hands.
 """
 
@@ -57,11 +58,11 @@ class RobotForScene(Protocol):
     """What a scene needs of a robot: `sim.robots.spec.RobotSpec` has it."""
 
     @property
-    def name(self) -> str: ...  # noqa: D102
+    def name(self) -> str: ...
     @property
-    def mjcf_path(self) -> Path: ...  # noqa: D102
+    def mjcf_path(self) -> Path: ...
     @property
-    def root_body(self) -> str: ...  # noqa: D102
+    def root_body(self) -> str: ...
 
 
 @dataclass(frozen=True, slots=True)

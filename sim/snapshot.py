@@ -1,8 +1,8 @@
 """Exact copies of a world: restoring one and repeating the same commands gives bit-equal results.
 
-A snapshot holds MuJoCo's integration state (positions, velocities, controls, solver warm start, active constraints), the parts
-of the model that the world changes while it runs (grasp constraints, collision bits, colours, masses), every object's state, the
-recorder and the random stream. Paper: undo, redo, save and load of DualTHOR, which drop held objects there.
+A snapshot holds MuJoCo's integration state (positions, velocities, controls, solver warm start, active constraints), the
+parts of the model that the world changes while it runs (grasp constraints, collision bits, colours, masses), every object's
+state, the recorder and the random stream. Paper: undo, redo, save and load of DualTHOR, which drop held objects there.
 """
 
 from __future__ import annotations
@@ -55,9 +55,7 @@ class WorldSnapshot:
     rng: dict[str, Any]
 
 
-def read_physics(
-    model: mujoco.MjModel, data: mujoco.MjData
-) -> tuple[NDArray[np.float64], dict[str, NDArray[Any]]]:
+def read_physics(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[NDArray[np.float64], dict[str, NDArray[Any]]]:
     """Copies of the integration state and of the model's changing arrays."""
     state = np.empty(mujoco.mj_stateSize(model, STATE_SIGNATURE))
     mujoco.mj_getState(model, data, state, STATE_SIGNATURE)

@@ -97,7 +97,9 @@ class World:
         self.model: mujoco.MjModel = copy.copy(compile_scene(key))
         self.data = mujoco.MjData(self.model)
         self._key = key
-        self.objects: dict[str, ObjectInstance] = {name: index_object(self.model, name, self.catalogue) for name in (*fixed, *ids)}
+        self.objects: dict[str, ObjectInstance] = {
+            name: index_object(self.model, name, self.catalogue) for name in (*fixed, *ids)
+        }
         self._base_mass = self.model.body_mass.copy()
         self._base_inertia = self.model.body_inertia.copy()
         self.part_of_geom = {name: self._parts(thing) for name, thing in self.objects.items()}
@@ -189,6 +191,7 @@ class World:
         was_open = carrier.openness
         carrier.openness = 1.0  # a start in a closed cabinet is allowed; only hands need the door open
         target = None if placement.xy is None else np.asarray(placement.xy, dtype=float)
+        spot: NDArray[np.float64] | None = None
         for gap in (0.0,) if target is not None else (_HAND_GAP_M, 0.04, 0.01):
             spot = find_free_spot(
                 self.data,
@@ -210,12 +213,12 @@ class World:
         if target is not None:
             if np.linalg.norm(spot[:2] - target) > 0.03:
                 raise WorldError(
-                    f"{placement.object_id} does not fit at {placement.xy} on {placement.receptacle}; nearest free spot {spot[:2]}"
+                    f"{placement.object_id} does not fit at {placement.xy} on {placement.receptacle}; nearest free is {spot[:2]}"
                 )
             spot[:2] = target
         half = np.radians(placement.yaw_deg) / 2.0
         adr = thing.qpos_adr
-        self.data.qpos[adr : adr + 3] = spot + (0.0, 0.0, 0.002 - thing.local_min[2])
+        self.data.qpos[adr : adr + 3] = spot + np.array([0.0, 0.0, 0.002 - thing.local_min[2]])
         self.data.qpos[adr + 3 : adr + 7] = (np.cos(half), 0.0, 0.0, np.sin(half))
         self._start_state(thing, placement.state)
         mujoco.mj_kinematics(self.model, self.data)
@@ -486,7 +489,8 @@ class World:
         points = thing.type.grips.get(kind)
         if points is None:
             middle = (thing.local_min + thing.local_max) / 2.0
-            points = (tuple(middle),) if kind == "single" else tuple((x, middle[1], middle[2]) for x in (thing.local_max[0], thing.local_min[0]))
+            ends = (middle[0],) if kind == "single" else (thing.local_max[0], thing.local_min[0])
+            points = tuple((x, middle[1], middle[2]) for x in ends)
         pose = self.pose(object_id)
         return np.asarray(points) @ pose[:3, :3].T + pose[:3, 3]
 
@@ -590,8 +594,9 @@ class World:
             thing.state.isFilledWithLiquid, thing.state.fillLiquid = False, ""
         if "iquid" in name or name == "isBroken":
             self._update_mass(thing)
-        if name == "isToggled" and object_id in self.room.links and self.object(self.room.links[object_id]).type.has("heat_source"):
-            self.set_state(self.room.links[object_id], name, value)
+        target = self.room.links.get(object_id)
+        if name == "isToggled" and target is not None and self.object(target).type.has("heat_source"):
+            self.set_state(target, name, value)
         dynamics.look(self, thing)
 
     def liquid_kg(self, object_id: str) -> float:
@@ -668,13 +673,18 @@ class World:
         """Everything the future depends on."""
         physics, arrays = read_physics(self.model, self.data)
         objects = {
-            name: {"state": copy_state(thing.state), "held_by": list(thing.held_by), "openness": thing.openness, "mass_kg": thing.mass_kg}
+            name: {
+                "state": copy_state(thing.state),
+                "held_by": list(thing.held_by),
+                "openness": thing.openness,
+                "mass_kg": thing.mass_kg,
+            }
             for name, thing in self.objects.items()
         }
         released = list(self.constraints.released) if self.constraints is not None else []
         counters = {"steps": self._steps, "speeds": dict(self._speeds), "released": released}
         frames = tuple(self.recorder.frames) if self.recorder is not None else ()
-        return WorldSnapshot(repr(self._key), physics, arrays, objects, counters, frames, self.rng.bit_generator.state)
+        return WorldSnapshot(repr(self._key), physics, arrays, objects, counters, frames, dict(self.rng.bit_generator.state))
 
     def restore(self, snapshot: WorldSnapshot) -> None:
         """Returns to a saved moment.

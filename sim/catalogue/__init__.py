@@ -266,7 +266,10 @@ def load_catalogue(path: Path = CATALOGUE_PATH) -> Catalogue:
     raw = yaml.safe_load(path.read_text(encoding="utf-8"))
     if raw.get("version") != _VERSION:
         raise ValueError(f"{path.name}: version {raw.get('version')!r} is not supported; expected {_VERSION}")
-    colors = {name: (*map(float, value), *([1.0] if len(value) == 3 else [])) for name, value in raw["colors"].items()}
+    colors: dict[str, tuple[float, float, float, float]] = {}
+    for name, value in raw["colors"].items():
+        r, g, b, a = (*map(float, value), 1.0)[:4]
+        colors[name] = (r, g, b, a)
     types: dict[str, ObjectType] = {}
     for name, entry in raw["types"].items():
         entry = dict(entry)
