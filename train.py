@@ -1,0 +1,96 @@
+"""Trains Proprio-MLLM: `python train.py stage=all model=tiny` (paper, three stages; `stage=base` stands in for pretraining).
+
+Stages: data (motions to clips shards), collect (views and demonstrations), base, pointmap, tokenizer, alignment, selu; `all` runs
+them in order and skips what is current. Options are documented in configs/schema/train.py.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from configs.compose import compose
+from configs.schema.train import TrainConfig
+from configs.validate import ConfigError, build
+
+logger = logging.getLogger("train")
+
+TRAINING_STAGES = ("base", "pointmap", "tokenizer", "alignment", "selu")
+
+
+def make_data(cfg: TrainConfig) -> None:
+    """Motions: generate or load, retarget to both robots, filter, replay with head-camera frames, write `clips` shards."""
+    from data.pipeline import prepare_clips
+    from proprio_mllm.training.paths import StagePaths
+    from sim.replay import replay_clip
+
+    prepare_clips(cfg.data, StagePaths(cfg).shards("clips"), replay_clip, workers=cfg.collect.workers, seed=cfg.seed)
+
+
+def make_shards(cfg: TrainConfig) -> None:
+    """Posed views, and the expert's demonstrations on training tasks."""
+    from configs.schema.collect import CollectConfig as ShardConfig
+    from proprio_mllm.training.paths import StagePaths
+    from sim.collect import collect
+
+    for kind, count, part in (("views", cfg.collect.views, 240), ("demos", cfg.collect.episodes, 10)):
+        out = StagePaths(cfg).shards(kind)
+        shards = ShardConfig(
+            kind=kind, out=str(out), count=count, seed=cfg.seed, image_size=cfg.model.image_size, part_size=part,
+            workers=cfg.collect.workers,
+        )  # fmt: skip
+        collect(shards, overwrite=cfg.overwrite)
+
+
+def run(cfg: TrainConfig) -> dict[str, Any]:
+    """Runs the asked stages; returns the metrics of those that ran."""
+    if cfg.stage in ("all", "data"):
+        make_data(cfg)
+    if cfg.stage in ("all", "collect"):
+        make_shards(cfg)
+    wanted = TRAINING_STAGES if cfg.stage == "all" else tuple(name for name in TRAINING_STAGES if name == cfg.stage)
+    if not wanted:
+        return {}
+    import torch
+
+    from proprio_mllm.training.pipeline import Pipeline
+
+    if cfg.threads:
+        torch.set_num_threads(cfg.threads)
+    pipeline = Pipeline(cfg, _rollouts)
+    metrics = {name: pipeline.run(name) for name in wanted}
+    if cfg.release is not None:
+        from proprio_mllm.training.release import export
+
+        export(pipeline, cfg.release, " ".join(["python train.py", *sys.argv[1:]]))
+    return metrics
+
+
+def _rollouts(*args: Any, **kwargs: Any) -> Any:
+    """SELU's rollouts: the evaluation runs the actor in the simulator; training reads the shards it writes."""
+    from proprio_mllm.evaluation.rollouts import collect_rollouts
+
+    return collect_rollouts(*args, **kwargs)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Command line; 0 on success, 2 on a configuration that is not allowed."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    for noisy in ("httpx", "datasets", "filelock", "OpenGL"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+    try:
+        cfg = build(TrainConfig, compose("train", arguments))
+    except ConfigError as error:
+        sys.stderr.write(f"train.py: {error}\n")
+        return 2
+    run(cfg)
+    return 0
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")
+    sys.exit(main(sys.argv[1:]))
