@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-__all__ = ["NavigationMap", "Rectangle", "Stance", "wrap_angle"]
+__all__ = ["NavigationMap", "Rectangle", "Stance", "Ways", "wrap_angle"]
 
 _RESOLUTION_M = 0.05
 #: Extra metres of cost per metre of walking close to obstacles: keeps paths off the furniture where there is room.
@@ -84,6 +84,8 @@ class NavigationMap:
     _clearance: NDArray[np.float64] = field(init=False, repr=False)
     _graph: csr_matrix = field(init=False, repr=False)
     _free: NDArray[np.bool_] = field(init=False, repr=False)
+    _free_cells: NDArray[np.int64] = field(init=False, repr=False)
+    _free_points: NDArray[np.float64] = field(init=False, repr=False)
     _shape: tuple[int, int] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -100,6 +102,8 @@ class NavigationMap:
         grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)  # (R*C, 2), x fastest
         self._clearance = self.clearance(grid)  # (R*C,)
         self._free = self._clearance >= 0.0
+        self._free_cells = np.flatnonzero(self._free)
+        self._free_points = self.points(self._free_cells)
         self._graph = self._build_graph()
 
     def clearance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -135,28 +139,18 @@ class NavigationMap:
 
     def path(self, start: NDArray[np.float64], goal: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Shortest collision-free polyline (N >= 2, 2) from start to goal, or None when there is none."""
-        paths = self.paths(start, np.asarray(goal, dtype=np.float64)[None, :])
-        return paths[0]
+        goal = np.asarray(goal, dtype=np.float64)
+        return self.ways(start).to(goal)
 
-    def paths(self, start: NDArray[np.float64], goals: NDArray[np.float64]) -> list[NDArray[np.float64] | None]:
-        """As `path` for several goals (N, 2) at once: one search from the start serves all of them."""
+    def ways(self, start: NDArray[np.float64]) -> Ways:
+        """All shortest ways from a start, by one search."""
         start = np.asarray(start, dtype=np.float64)
         source = self._nearest_free_cell(start)
         if source is None:
-            return [None] * len(goals)
+            empty = np.full(self._free.shape, np.inf)
+            return Ways(self, start, -1, empty, np.full(self._free.shape, -1))
         distance, previous = dijkstra(self._graph, indices=source, return_predecessors=True)
-        found: list[NDArray[np.float64] | None] = []
-        for goal in goals:
-            cell = self._nearest_free_cell(goal, limit_m=1.5 * _RESOLUTION_M) if self.is_free(goal) else None
-            if cell is None or not np.isfinite(distance[cell]):
-                found.append(None)
-                continue
-            cells = [cell]
-            while cells[-1] != source:
-                cells.append(int(previous[cells[-1]]))
-            middle = self._points(np.array(cells[::-1]))
-            found.append(self._shorten(np.concatenate([start[None], middle, np.asarray(goal)[None]])))
-        return found
+        return Ways(self, start, source, distance, previous)
 
     def stances(
         self, target: NDArray[np.float64], distances_m: Iterable[float], bearing_rad: float = 0.0, count: int = 48
@@ -182,17 +176,21 @@ class NavigationMap:
 
     def free_positions(self) -> NDArray[np.float64]:
         """(N, 2) centres of all free grid cells."""
-        return self._points(np.flatnonzero(self._free))
+        return self._free_points.copy()
 
-    def _points(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+    def cell_of(self, position: NDArray[np.float64]) -> int | None:
+        """The free grid cell next to a free position."""
+        return self._nearest_free_cell(position, limit_m=1.5 * _RESOLUTION_M) if self.is_free(position) else None
+
+    def points(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
         rows, columns = np.divmod(cells, self._shape[1])
         return np.stack([self.bounds[0] + columns * _RESOLUTION_M, self.bounds[1] + rows * _RESOLUTION_M], axis=1)
 
     def _nearest_free_cell(self, position: NDArray[np.float64], limit_m: float = 0.6) -> int | None:
-        cells = np.flatnonzero(self._free)
+        cells = self._free_cells
         if len(cells) == 0:
             return None
-        gaps = np.linalg.norm(self._points(cells) - position, axis=1)
+        gaps = np.linalg.norm(self._free_points - position, axis=1)
         best = int(np.argmin(gaps))
         return int(cells[best]) if gaps[best] <= limit_m else None
 
@@ -215,7 +213,7 @@ class NavigationMap:
         size = rows * columns
         return csr_matrix((np.concatenate(weights), (np.concatenate(starts), np.concatenate(ends))), shape=(size, size))
 
-    def _shorten(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def shorten(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Drops waypoints that a straight way makes superfluous (greedy, farthest first)."""
         kept = [points[0]]
         index = 0
@@ -226,3 +224,38 @@ class NavigationMap:
             kept.append(points[reach])
             index = reach
         return np.stack(kept)
+
+
+@dataclass(frozen=True, slots=True)
+class Ways:
+    """The shortest ways from one start to everywhere.
+
+    Attributes:
+        map: the free space.
+        start: (2,) metres.
+        source: grid cell of the start, -1 when it is nowhere near free space.
+        distance: (R * C,) cost of the way to each cell, infinite where there is none.
+        previous: (R * C,) cell before each cell on its way.
+    """
+
+    map: NavigationMap
+    start: NDArray[np.float64]
+    source: int
+    distance: NDArray[np.float64]
+    previous: NDArray[np.int64]
+
+    def cost_m(self, goal: NDArray[np.float64]) -> float:
+        """Cost of the way to a position, infinite when there is none."""
+        cell = self.map.cell_of(goal)
+        return float("inf") if cell is None else float(self.distance[cell])
+
+    def to(self, goal: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Polyline (N >= 2, 2) to a position, None when there is none."""
+        cell = self.map.cell_of(goal)
+        if cell is None or not np.isfinite(self.distance[cell]):
+            return None
+        cells = [cell]
+        while cells[-1] != self.source:
+            cells.append(int(self.previous[cells[-1]]))
+        middle = self.map.points(np.array(cells[::-1]))
+        return self.map.shorten(np.concatenate([self.start[None], middle, np.asarray(goal)[None]]))

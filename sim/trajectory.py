@@ -1,9 +1,9 @@
 """Smooth trajectories with bounded velocity and acceleration, for joints and for the base.
 
-A path is a natural-speed cubic spline through waypoints; it is followed with a minimum-jerk time law
+Joints follow a cubic spline through waypoints with a minimum-jerk time law
 `s(t) = 10 u^3 - 15 u^4 + 6 u^5`, `u = t / T`, which starts and ends at rest with zero acceleration. The duration T is the
-shortest one at which the sampled velocity and acceleration of every coordinate stay within bounds. Used for the paper's
-"continuous transitions"; the paper does not name a time law.
+shortest one at which the sampled velocity and acceleration of every coordinate stay within bounds. The base
+follows straight segments with smooth speed ramps. Used for the paper's "continuous transitions"; the paper names no time law.
 
 Shape letters: N waypoints, D coordinates, S samples.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-__all__ = ["Trajectory", "min_jerk", "plan", "plan_polyline"]
+__all__ = ["PolylineTrajectory", "Trajectory", "min_jerk", "plan", "plan_polyline"]
 
 #: Peak speed and acceleration of the minimum-jerk law for unit distance and unit duration.
 _PEAK_SPEED = 1.875
@@ -38,7 +38,7 @@ class Trajectory:
         knots: (N,) path parameter of the waypoints, from 0 to 1.
         waypoints: (N, D) coordinates.
         duration_s: time from the first waypoint to the last.
-        spline: curve through the waypoints, None when straight lines join them.
+        spline: curve through the waypoints, None for two of them.
     """
 
     knots: NDArray[np.float64]
@@ -53,10 +53,7 @@ class Trajectory:
         s = min_jerk(time_s / self.duration_s)
         if self.spline is not None:
             return np.asarray(self.spline(s), dtype=np.float64)
-        index = min(int(np.searchsorted(self.knots, s, side="right")) - 1, len(self.knots) - 2)
-        span = self.knots[index + 1] - self.knots[index]
-        blend = (s - self.knots[index]) / span
-        return (1.0 - blend) * self.waypoints[index] + blend * self.waypoints[index + 1]
+        return (1.0 - s) * self.waypoints[0] + s * self.waypoints[1]
 
 
 def _knots(waypoints: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -114,7 +111,47 @@ def plan(
     return Trajectory(knots, waypoints, max(by_speed, by_acceleration, min_duration_s), spline)
 
 
-def plan_polyline(waypoints: NDArray[np.float64], speed: float, acceleration: float) -> Trajectory:
+@dataclass(frozen=True, slots=True)
+class PolylineTrajectory:
+    """Straight segments followed exactly: smooth acceleration, constant speed, smooth braking.
+
+    Attributes:
+        lengths_m: (N,) arc length of the waypoints from the start.
+        waypoints: (N, D) coordinates.
+        speed: speed of the constant part.
+        ramp_s: duration of the speed-up and of the slow-down (the speed follows the smoothstep `3 u^2 - 2 u^3`).
+    """
+
+    lengths_m: NDArray[np.float64]
+    waypoints: NDArray[np.float64]
+    speed: float
+    ramp_s: float
+
+    @property
+    def duration_s(self) -> float:
+        """Time from start to end."""
+        return 0.0 if self.speed <= 0.0 else float(self.lengths_m[-1]) / self.speed + self.ramp_s
+
+    def travelled(self, time_s: float) -> float:
+        """Arc length at a time."""
+        total, end = float(self.lengths_m[-1]), self.duration_s
+        if time_s >= end:
+            return total
+        if time_s > end - self.ramp_s:
+            return total - self._ramp(end - time_s)
+        return self._ramp(time_s) if time_s < self.ramp_s else self.speed * (time_s - 0.5 * self.ramp_s)
+
+    def at(self, time_s: float) -> NDArray[np.float64]:
+        """(D,) coordinates at a time, held at the ends."""
+        arc = self.travelled(max(time_s, 0.0))
+        return np.array([np.interp(arc, self.lengths_m, column) for column in self.waypoints.T])
+
+    def _ramp(self, time_s: float) -> float:
+        u = min(max(time_s / self.ramp_s, 0.0), 1.0)
+        return self.speed * self.ramp_s * (u**3 - 0.5 * u**4)
+
+
+def plan_polyline(waypoints: NDArray[np.float64], speed: float, acceleration: float) -> PolylineTrajectory:
     """Follows straight segments exactly, with bounded speed along the path (the base must not cut corners).
 
     Args:
@@ -128,13 +165,10 @@ def plan_polyline(waypoints: NDArray[np.float64], speed: float, acceleration: fl
     waypoints = np.asarray(waypoints, dtype=np.float64)
     _check(waypoints, np.array([speed]), np.array([acceleration]))
     steps = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
-    keep = np.concatenate([[True], steps > 1e-9])
-    if keep.sum() < 2:
-        return Trajectory(np.array([0.0, 1.0]), waypoints[[0, -1]], 0.0)
-    points = waypoints[keep]
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    length = float(steps.sum())
-    knots = np.concatenate([[0.0], np.cumsum(steps) / length])
-    knots[-1] = 1.0
-    duration = max(_PEAK_SPEED * length / speed, float(np.sqrt(_PEAK_ACCELERATION * length / acceleration)))
-    return Trajectory(knots, points, duration)
+    points = waypoints[np.concatenate([[True], steps > 1e-9])]
+    lengths = np.concatenate([[0.0], np.cumsum(steps[steps > 1e-9])])
+    total = float(lengths[-1])
+    if total <= 0.0:
+        return PolylineTrajectory(np.zeros(1), points[:1], 0.0, 0.0)
+    top = min(speed, float(np.sqrt(total * acceleration / 1.5)))  # the ramps of a short way leave no constant part
+    return PolylineTrajectory(lengths, points, top, 1.5 * top / acceleration)

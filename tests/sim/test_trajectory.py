@@ -22,7 +22,7 @@ def test_velocity_and_acceleration_stay_within_bounds(count):
     acceleration = np.gradient(velocity, times, axis=0)
     assert np.all(np.abs(velocity) <= v * 1.02)
     assert np.all(np.abs(acceleration[2:-2]) <= a * 1.05)
-    assert np.abs(velocity[0]).max() < 0.02 and np.abs(velocity[-1]).max() < 0.02
+    assert np.abs(velocity[[0, -1]]).max() < 0.02
 
 
 def test_spline_passes_its_waypoints():
@@ -37,7 +37,17 @@ def test_polyline_does_not_cut_corners():
     _, positions = _sampled(corner)
     off = np.minimum(np.abs(positions[:, 1]), np.abs(positions[:, 0] - 1.0))
     assert off.max() < 1e-9
-    assert corner.duration_s == pytest.approx(1.875 * 2.0 / 0.8)
+    assert corner.duration_s == pytest.approx(2.0 / 0.8 + 1.5 * 0.8 / 1.5)
+
+
+@pytest.mark.parametrize("length", [0.05, 0.5, 4.0])
+def test_polyline_speed_and_acceleration_are_bounded(length):
+    trajectory = plan_polyline(np.array([[0.0, 0.0], [length, 0.0]]), 0.8, 1.5)
+    times, positions = _sampled(trajectory, 4001)
+    speed = np.gradient(positions[:, 0], times)
+    assert speed.max() <= 0.8 * 1.001
+    assert np.abs(np.gradient(speed, times)).max() <= 1.5 * 1.01
+    assert positions[-1, 0] == pytest.approx(length)
 
 
 def test_zero_length_and_minimum_duration():

@@ -1,0 +1,431 @@
+"""The robot as skills see it: commanded posture, inverse kinematics in the world, hands, and what they hold.
+
+Skills own disjoint sets of joints: an arm skill its arm and hand, a body skill base and legs, a two-arm skill both arms and the
+waist. `Body` has no state of its own: what is commanded is in the simulator's controls and what is held in the objects, so that a
+world snapshot is a snapshot of everything. The waist stays straight while a single arm acts, so that parallel arm skills do not
+disturb each other.
+
+Paper: low-level control through inverse kinematics (each arm alone, or the whole body).
+Frames: `world`; `pelvis` is the pelvis heading frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Arm
+from sim.navigation import NavigationMap, Stance
+from sim.objects import ObjectInstance
+from sim.robots.arm_ik import PerArmSolver
+from sim.robots.build_solver import robot_kit
+from sim.robots.solver import ReachTarget
+from sim.scene import BASE_JOINTS
+from sim.skills.clearance import ClearanceProbe
+from sim.skills.obstacles import navigation_map
+from sim.skills.reach_map import HandPose, ReachMap, reach_maps
+from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.trajectory import plan
+from sim.world import World
+
+__all__ = ["ArmGoal", "Body", "ready_posture", "wait"]
+
+Array = NDArray[np.float64]
+
+ARM_SPEED_RAD_S: Final = 3.5
+ARM_ACCELERATION_RAD_S2: Final = 16.0
+HAND_SECONDS: Final = 0.35
+#: Position error of an arm posture that still counts as reaching.
+REACH_TOLERANCE_M: Final = 0.012
+#: Steps of pelvis height tried when a target is out of reach, metres.
+_HEIGHT_STEP_M: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class ArmGoal:
+    """A solved arm posture.
+
+    Attributes:
+        q: (A,) arm joints.
+        error_m: distance of the grasp site from the wish.
+        pointing_cos, closing_cos: how well the hand's axes agree with the wish, 1 where it left them open.
+    """
+
+    q: Array
+    error_m: float
+    pointing_cos: float
+    closing_cos: float
+
+
+class Body:
+    """One robot in a world."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        if world.robot is None:
+            raise ValueError("skills need a world with a robot, got one without")
+        self.spec = world.robot
+        kit = robot_kit(self.spec.name)
+        self.kinematics = kit.model
+        self.crouches = kit.crouches
+        self.whole_body = kit.solver
+        self._per_arm = PerArmSolver(kit.model, kit.crouches)
+        self.maps: Mapping[str, ReachMap] = reach_maps(self.spec.name)
+        model = world.model
+        self._actuators = {name: int(model.actuator(name).id) for name in self.spec.joints if _has_actuator(model, name)}
+        self._base = [int(model.actuator(name).id) for name in BASE_JOINTS]  # x, y, z, yaw, pitch
+        self._joint_adr = np.array([int(model.joint(name).qposadr[0]) for name in self.spec.joints])
+        self._site = {arm: int(model.site(self.spec.arms[arm.value].grasp_site).id) for arm in Arm}
+        self._arm_ids = {arm: np.array([self._actuators[name] for name in self.spec.arms[arm.value].joints]) for arm in Arm}
+        self._hand_ids = {arm: np.array([self._actuators[name] for name in self.spec.arms[arm.value].hand_joints]) for arm in Arm}
+        self._columns = {arm: kit.model.indices(self.spec.arms[arm.value].joints) for arm in Arm}
+        self._vias: dict[Arm, tuple[Array, ...]] = {}
+        self.probe = ClearanceProbe(world, self)
+
+    # ---- base and legs
+
+    def base(self) -> Stance:
+        """Where the base is."""
+        x, y, _, yaw = self.world.base_pose[:4]
+        return Stance(float(x), float(y), float(yaw))
+
+    def commanded_base(self) -> Stance:
+        """Where the base is told to be."""
+        x, y, _, yaw = self.world.data.ctrl[self._base[:4]]
+        return Stance(float(x), float(y), float(yaw))
+
+    @property
+    def pelvis_height_m(self) -> float:
+        """Commanded pelvis height."""
+        return float(self.world.data.ctrl[self._base[2]])
+
+    def base_error_m(self) -> float:
+        """Distance between commanded and actual base, the heading weighed with 0.3 m per radian."""
+        x, y, z, yaw = self.world.data.ctrl[self._base[:4]] - self.world.base_pose[:4]
+        return float(np.sqrt(x * x + y * y + z * z + (0.3 * yaw) ** 2))
+
+    def command_base(self, x: float, y: float, yaw_rad: float) -> None:
+        """Sets the base target, world frame."""
+        self.world.data.ctrl[[self._base[0], self._base[1], self._base[3]]] = (x, y, yaw_rad)
+
+    def command_height(self, pelvis_height_m: float) -> None:
+        """Sets the pelvis height and the legs that go with it."""
+        self.world.command_height(pelvis_height_m)
+
+    def navigation(self) -> NavigationMap:
+        """Free space for the base, as the room is now."""
+        return navigation_map(self.world, self.spec.footprint_radius_m)
+
+    def comfortable_distance_m(self) -> tuple[float, float]:
+        """Horizontal distances between pelvis and object at which the arms work best: 55 to 80 % of the stretched arm."""
+        reach = self.maps["left"].reach_m
+        return 0.55 * reach, 0.8 * reach
+
+    # ---- objects
+
+    def thing(self, object_id: str) -> ObjectInstance:
+        """An object of the scene by id."""
+        return self.world.objects[object_id]
+
+    def world_position(self, object_id: str) -> Array:
+        """(3,) centre of an object's bounding box in the world."""
+        thing = self.thing(object_id)
+        rotation = self.world.data.xmat[thing.body_id].reshape(3, 3)
+        return self.world.data.xpos[thing.body_id] + rotation @ (0.5 * (thing.local_min + thing.local_max))
+
+    def solid_geoms(self, thing: ObjectInstance) -> NDArray[np.int64]:
+        """Geoms of an object that take part in contacts."""
+        return thing.geom_ids[self.world.model.geom_contype[thing.geom_ids] > 0]
+
+    def rests(self, thing: ObjectInstance) -> bool:
+        """Whether an object touches something that is not part of the robot, from above."""
+        data, mine = self.world.data, set(map(int, thing.geom_ids))
+        owner = self.world.object_of_geom
+        for contact in data.contact[: data.ncon]:
+            a, b = int(contact.geom1), int(contact.geom2)
+            other = b if a in mine else a if b in mine else -1
+            if other >= 0 and (owner[other] >= 0 or other == 0) and abs(float(contact.frame[2])) > 0.6 and contact.dist < 0.0:
+                return True
+        return False
+
+    def free_spots(self, thing: ObjectInstance, receptacle: ObjectInstance, arm: Arm, count: int = 4) -> list[Array]:
+        """Free spots (3,) on a receptacle for an object, the ones the arm reaches most easily first."""
+        easy = self.easy_point(arm)
+        spots: list[Array] = []
+        for gap in (0.04, 0.01):
+            for dx, dy in ((0.0, 0.0), (0.0, 0.12), (0.0, -0.12), (0.1, 0.0), (-0.1, 0.0), (0.0, 0.25), (0.0, -0.25), (0.15, 0.0)):
+                near = easy[:2] + self.turn_to_world(np.array([dx, dy, 0.0]))[:2]
+                spot = self.world.free_spot(
+                    receptacle.object_id, thing.footprint_radius_m, height_m=thing.height_m, near=near, gap_m=gap,
+                    ignore=(thing.object_id,), band_m=10.0,
+                )  # fmt: skip
+                if spot is not None and all(float(np.linalg.norm(spot - known)) > 0.03 for known in spots):
+                    spots.append(spot)
+                if len(spots) >= count:
+                    return spots
+            if spots:
+                return spots
+        return spots
+
+    def easy_point(self, arm: Arm) -> Array:
+        """World point before the shoulder that the arm reaches most easily."""
+        low, high = self.comfortable_distance_m()
+        side = 0.6 if arm is Arm.LEFT else -0.6
+        base = self.commanded_base()
+        local = np.array([0.5 * (low + high), side * abs(float(self.maps[arm.value].shoulder[1])), 0.0])
+        return self.turn_to_world(local) + (base.x, base.y, self.pelvis_height_m)
+
+    @property
+    def held(self) -> dict[Arm, str | None]:
+        """What each hand holds."""
+        found: dict[Arm, str | None] = {arm: None for arm in Arm}
+        for name, thing in self.world.objects.items():
+            for arm in thing.held_by:
+                found[Arm(arm)] = name
+        return found
+
+    @property
+    def lifted(self) -> str | None:
+        """The object that both hands hold together."""
+        return next((name for name, thing in self.world.objects.items() if len(thing.held_by) == 2), None)
+
+    # ---- frames
+
+    def to_pelvis(self, point: Array, pelvis_height_m: float | None = None) -> Array:
+        """A world point in the pelvis frame, for the commanded base and a pelvis height (the commanded one by default)."""
+        base = self.commanded_base()
+        height = self.pelvis_height_m if pelvis_height_m is None else pelvis_height_m
+        return self.turn_to_pelvis(np.asarray(point, dtype=float) - (base.x, base.y, height))
+
+    def turn_to_pelvis(self, direction: Array) -> Array:
+        """A world direction in the pelvis frame."""
+        yaw = self.commanded_base().yaw_rad
+        c, s = np.cos(yaw), np.sin(yaw)
+        return np.array([c * direction[0] + s * direction[1], -s * direction[0] + c * direction[1], direction[2]])
+
+    def turn_to_world(self, direction: Array) -> Array:
+        """A direction of the pelvis frame in the world."""
+        yaw = self.commanded_base().yaw_rad
+        c, s = np.cos(yaw), np.sin(yaw)
+        return np.array([c * direction[0] - s * direction[1], s * direction[0] + c * direction[1], direction[2]])
+
+    def in_trunk(self, point: Array, pelvis_height_m: float | None = None) -> Array:
+        """A world point in the frame of the reach maps: the pelvis frame, turned with the trunk's lean."""
+        height = self.pelvis_height_m if pelvis_height_m is None else pelvis_height_m
+        return self._lean(height).T @ self.to_pelvis(point, height)
+
+    def shoulder(self, arm: Arm) -> Array:
+        """World position of a shoulder, from the commanded base."""
+        base = self.commanded_base()
+        x, y, z = self._lean(self.pelvis_height_m) @ self.maps[arm.value].shoulder
+        c, s = np.cos(base.yaw_rad), np.sin(base.yaw_rad)
+        return np.array([base.x + c * x - s * y, base.y + s * x + c * y, self.pelvis_height_m + z])
+
+    def _lean(self, pelvis_height_m: float) -> Array:
+        """(3, 3) rotation of the trunk's lean at a pelvis height, pelvis frame."""
+        pitch = self.crouches.pitch(pelvis_height_m)
+        c, s = np.cos(pitch), np.sin(pitch)
+        return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+    # ---- inverse kinematics
+
+    def joints(self) -> Array:
+        """(J,) commanded joints where there is an actuator, measured ones elsewhere."""
+        q = self.world.data.qpos[self._joint_adr].copy()
+        for column, name in enumerate(self.spec.joints):
+            if name in self._actuators:
+                q[column] = self.world.data.ctrl[self._actuators[name]]
+        return q
+
+    def hand_pose(self, arm: Arm) -> tuple[Array, Array]:
+        """Measured world position (3,) and rotation (3, 3) of the grasp site."""
+        site = self._site[arm]
+        return self.world.data.site_xpos[site].copy(), self.world.data.site_xmat[site].reshape(3, 3).copy()
+
+    def commanded_arm(self, arm: Arm) -> Array:
+        """(A,) commanded arm joints."""
+        return self.world.data.ctrl[self._arm_ids[arm]].copy()
+
+    def ready(self, arm: Arm) -> Array:
+        """(A,) posture between actions: hand before the shoulder, fingers level ahead, above tables and beside the camera's view."""
+        return ready_posture(self.spec.name, arm)
+
+    def solve(
+        self,
+        arm: Arm,
+        wish: HandPose,
+        start: Array | None = None,
+        pelvis_height_m: float | None = None,
+        pointing_weight: float = 0.1,
+        roll_weight: float = 0.1,
+    ) -> ArmGoal:
+        """Solves one arm for a hand pose given in the world, waist straight.
+
+        Args:
+            arm: which one.
+            wish: the hand pose, position and directions in the world frame.
+            start: (A,) joints to start from; the best postures of the reach map when None.
+            pelvis_height_m: pelvis height to solve for, the commanded one by default.
+            pointing_weight: weight of the fingers' direction against the position.
+            roll_weight: weight of the closing direction.
+        """
+        height = self.pelvis_height_m if pelvis_height_m is None else pelvis_height_m
+        lean = self._lean(height)
+        local = HandPose(
+            self.to_pelvis(wish.position, height),
+            None if wish.pointing is None else self.turn_to_pelvis(wish.pointing),
+            None if wish.closing is None else self.turn_to_pelvis(wish.closing),
+            wish.either_way,
+        )
+        reach_map = self.maps[arm.value]
+        starts: Sequence[Array]
+        if start is None:
+            upright = HandPose(
+                lean.T @ local.position,
+                None if local.pointing is None else lean.T @ local.pointing,
+                None if local.closing is None else lean.T @ local.closing,
+                local.either_way,
+            )
+            starts = list(reach_map.starts(upright, 2))
+        else:
+            starts = [start]
+        best: tuple[float, ArmGoal] | None = None
+        q = self.kinematics.posture()
+        root = np.array([0.0, 0.0, 0.0, *_quaternion_about_y(self.crouches.pitch(height))])
+        site = (self.spec.arms[arm.value].grasp_site,)
+        for candidate in starts:
+            q[self._columns[arm]] = candidate
+            rotation = None
+            if local.pointing is not None or local.closing is not None:
+                hand = self.kinematics.frames(root, q, site)[0, :3, :3]
+                rotation = local.rotation(hand[:, 0], hand[:, 1])
+            target = ReachTarget(
+                local.position,
+                rotation,
+                pointing_weight if local.pointing is not None else 0.0,
+                roll_weight if local.closing is not None else 0.0,
+            )
+            result = self._per_arm.solve({arm.value: target}, q, pelvis_height_m=height, restarts=0, tolerance_m=REACH_TOLERANCE_M)
+            reached = self.kinematics.frames(root, result.q, site)[0, :3, :3]
+            pointing = 1.0 if local.pointing is None else float(reached[:, 0] @ local.pointing)
+            along = 1.0 if local.closing is None else float(reached[:, 1] @ local.closing)
+            goal = ArmGoal(
+                result.q[self._columns[arm]].copy(),
+                result.position_error_m,
+                pointing,
+                abs(along) if local.either_way else along,
+            )
+            cost = 20.0 * max(goal.error_m - 0.5 * REACH_TOLERANCE_M, 0.0) + 2.0 - goal.pointing_cos - goal.closing_cos
+            if best is None or cost < best[0]:
+                best = (cost, goal)
+            if goal.error_m <= REACH_TOLERANCE_M and goal.pointing_cos > 0.9 and goal.closing_cos > 0.9:
+                break
+        assert best is not None
+        return best[1]
+
+    def heights_in_reach(self, arm: Arm, point: Array) -> list[float]:
+        """Pelvis heights, of a grid over the robot's range, at which the arm would reach a world point from this stance."""
+        low, high = self.spec.pelvis_height_range_m
+        heights = np.linspace(low, high, max(2, int(np.ceil((high - low) / _HEIGHT_STEP_M)) + 1))
+        reach_map = self.maps[arm.value]
+        good: list[float] = []
+        for height in heights:
+            if reach_map.contains(self.in_trunk(point, float(height))):
+                good.append(float(height))
+        return good
+
+    def vias(self, arm: Arm) -> tuple[Array, ...]:
+        """(A,) postures that lead around furniture edges: the ready one, and the hand forward at shoulder height."""
+        if arm not in self._vias:
+            reach_map = self.maps[arm.value]
+            high = reach_map.shoulder + reach_map.reach_m * np.array([0.6, 0.0, -0.05])
+            self._vias[arm] = (self.ready(arm), reach_map.starts(HandPose(high, np.array([1.0, 0.0, 0.0])), 1)[0])
+        return self._vias[arm]
+
+    # ---- motions
+
+    def move_arm(self, arm: Arm, waypoints: Sequence[Array], speed: float = 1.0) -> Skill:
+        """Moves the arm from its commanded posture through (A,) waypoints, at rest at the end; `speed` scales the bounds."""
+        ids = self._arm_ids[arm]
+        points = np.stack([self.world.data.ctrl[ids].copy(), *waypoints])
+        way = plan(points, ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed * speed)
+        time_s = 0.0
+        while time_s < way.duration_s:
+            time_s += CONTROL_DT_S
+            self.world.data.ctrl[ids] = way.at(time_s)
+            yield
+
+    def hand_target(self, arm: Arm) -> Array:
+        """Commanded hand joints."""
+        return self.world.data.ctrl[self._hand_ids[arm]].copy()
+
+    def command_hand(self, arm: Arm, opening: float) -> None:
+        """Sets the hand between closed (0) and open (1)."""
+        spec = self.spec.arms[arm.value]
+        closed, opened = np.asarray(spec.hand_closed), np.asarray(spec.hand_open)
+        self.world.data.ctrl[self._hand_ids[arm]] = closed + opening * (opened - closed)
+
+    def hand_opening(self, arm: Arm) -> float:
+        """Commanded opening, 0 closed to 1 open."""
+        spec = self.spec.arms[arm.value]
+        closed, opened = np.asarray(spec.hand_closed), np.asarray(spec.hand_open)
+        span = opened - closed
+        used = np.abs(span) > 1e-6
+        return float(np.mean((self.hand_target(arm) - closed)[used] / span[used]))
+
+    def move_hand(self, arm: Arm, opening: float, seconds: float = HAND_SECONDS) -> Skill:
+        """Opens or closes the hand at a constant rate."""
+        start = self.hand_opening(arm)
+        if abs(start - opening) < 0.02:
+            return
+        steps = max(1, round(seconds / CONTROL_DT_S))
+        for k in range(1, steps + 1):
+            self.command_hand(arm, start + (opening - start) * k / steps)
+            yield
+
+
+@lru_cache(maxsize=8)
+def ready_posture(robot_name: str, arm: Arm) -> Array:
+    """See `Body.ready`; solved once per robot and arm."""
+    kit, reach_map = robot_kit(robot_name), reach_maps(robot_name)[arm.value]
+    inward = np.array([0.0, -1.0 if arm is Arm.LEFT else 1.0, 0.0])
+    point = reach_map.shoulder + reach_map.reach_m * np.array([0.42, 0.0, -0.3])
+    wish = HandPose(point, np.array([1.0, 0.0, 0.0]), inward)
+    solver = PerArmSolver(kit.model, kit.crouches)
+    columns = kit.model.indices(kit.spec.arms[arm.value].joints)
+    site = (kit.spec.arms[arm.value].grasp_site,)
+    root = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    rotation = wish.rotation(wish.pointing, inward) if wish.pointing is not None else np.eye(3)
+    height = kit.spec.standing_pelvis_height_m
+    best: tuple[float, Array] | None = None
+    for start in reach_map.starts(wish, 12, radius_m=0.2):
+        q = kit.model.posture()
+        q[columns] = start
+        target = ReachTarget(point, rotation, 0.3, 0.2)
+        result = solver.solve({arm.value: target}, q, pelvis_height_m=height, restarts=0)
+        hand = kit.model.frames(root, result.q, site)[0, :3, :3]
+        cost = 5.0 * result.position_error_m + 2.0 - float(hand[0, 0]) - float(hand[:, 1] @ inward)
+        if best is None or cost < best[0]:
+            best = (cost, result.q[columns].copy())
+    assert best is not None
+    return best[1]
+
+
+def wait(seconds: float) -> Skill:
+    """Lets physics run."""
+    for _ in range(round(seconds / CONTROL_DT_S)):
+        yield
+
+
+def _has_actuator(model: mujoco.MjModel, name: str) -> bool:
+    return mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_ACTUATOR), name) >= 0
+
+
+def _quaternion_about_y(angle_rad: float) -> Array:
+    return np.array([np.cos(angle_rad / 2), 0.0, np.sin(angle_rad / 2), 0.0])

@@ -1,0 +1,117 @@
+"""Logical preconditions of arm skills: what can be refused before anything moves.
+
+Each check raises `SkillFailure` with one code. Their order is part of the contract: the state of the hands first, then what
+the object allows, then weight, then access. Reach is found out later, by the skills themselves.
+"""
+
+from __future__ import annotations
+
+from data.records import Arm
+from sim.failures import FailureCode, SkillFailure
+from sim.objects import ObjectInstance
+from sim.skills.body import Body
+
+__all__ = ["check_lift", "check_open_close", "check_pick", "check_place", "check_place_both", "check_toggle"]
+
+
+def _check_accessible(body: Body, thing: ObjectInstance) -> None:
+    """Refuses objects that are shut away."""
+    for name in body.world.parents(thing.object_id):
+        receptacle = body.thing(name)
+        if receptacle.moving and not receptacle.is_open:
+            raise SkillFailure(FailureCode.RECEPTACLE_CLOSED)
+
+
+def _check_free_hand(body: Body, arm: Arm) -> None:
+    if body.lifted is not None:
+        raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
+    if body.held[arm] is not None:
+        raise SkillFailure(FailureCode.HAND_OCCUPIED)
+
+
+def check_pick(body: Body, arm: Arm, thing: ObjectInstance) -> None:
+    """Preconditions of Pick."""
+    _check_free_hand(body, arm)
+    if thing.held_by:
+        raise SkillFailure(FailureCode.ALREADY_HELD)
+    if not thing.movable:
+        raise SkillFailure(FailureCode.NOT_PICKUPABLE)
+    limit = body.spec.arms[arm.value].max_load_kg
+    mass = body.world.total_mass_kg(thing.object_id)
+    if body.world.needs_two_hands(thing.object_id):
+        if mass > body.spec.two_arm_max_load_kg:
+            raise SkillFailure(FailureCode.TOO_HEAVY, {"mass_kg": mass - body.spec.two_arm_max_load_kg})
+        raise SkillFailure(FailureCode.NEEDS_TWO_HANDS, {"mass_kg": mass - limit})
+    if not thing.type.pickupable:
+        raise SkillFailure(FailureCode.NOT_PICKUPABLE)
+    if thing.is_broken:
+        raise SkillFailure(FailureCode.OBJECT_BROKEN)
+    _check_accessible(body, thing)
+
+
+def check_place(body: Body, arm: Arm, receptacle: ObjectInstance) -> ObjectInstance:
+    """Preconditions of Place; returns what the hand holds."""
+    if body.lifted is not None:
+        raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
+    name = body.held[arm]
+    if name is None:
+        raise SkillFailure(FailureCode.HAND_EMPTY)
+    _check_receptacle(body, receptacle, name)
+    return body.thing(name)
+
+
+def _check_receptacle(body: Body, receptacle: ObjectInstance, held: str) -> None:
+    if not receptacle.type.receptacle or receptacle.object_id == held:
+        raise SkillFailure(FailureCode.NOT_RECEPTACLE)
+    if receptacle.held_by:
+        raise SkillFailure(FailureCode.IN_USE)
+    if receptacle.moving and not receptacle.is_open and all(surface.spec.inside for surface in receptacle.surfaces):
+        raise SkillFailure(FailureCode.RECEPTACLE_CLOSED)
+    _check_accessible(body, receptacle)
+
+
+def check_open_close(body: Body, arm: Arm, thing: ObjectInstance, opening: bool) -> None:
+    """Preconditions of Open and Close."""
+    _check_free_hand(body, arm)
+    if not thing.moving:
+        raise SkillFailure(FailureCode.NOT_OPENABLE)
+    if thing.held_by:
+        raise SkillFailure(FailureCode.IN_USE)
+    if (thing.openness > 0.6) if opening else (thing.openness < 0.06):
+        raise SkillFailure(FailureCode.ALREADY_IN_STATE)
+
+
+def check_toggle(body: Body, arm: Arm, thing: ObjectInstance, on: bool) -> None:
+    """Preconditions of ToggleOn and ToggleOff."""
+    _check_free_hand(body, arm)
+    if thing.toggle_site < 0:
+        raise SkillFailure(FailureCode.NOT_TOGGLEABLE)
+    if thing.is_toggled == on:
+        raise SkillFailure(FailureCode.ALREADY_IN_STATE)
+    if thing.is_broken:
+        raise SkillFailure(FailureCode.OBJECT_BROKEN)
+
+
+def check_lift(body: Body, thing: ObjectInstance) -> None:
+    """Preconditions of Lift."""
+    if body.lifted is not None:
+        raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
+    if any(name is not None for name in body.held.values()):
+        raise SkillFailure(FailureCode.HAND_OCCUPIED)
+    if not thing.movable:
+        raise SkillFailure(FailureCode.NOT_LIFTABLE)
+    mass = body.world.total_mass_kg(thing.object_id)
+    if mass > body.spec.two_arm_max_load_kg:
+        raise SkillFailure(FailureCode.TOO_HEAVY, {"mass_kg": mass - body.spec.two_arm_max_load_kg})
+    if not body.world.needs_two_hands(thing.object_id) and max(thing.type.size[:2]) < 0.2:
+        raise SkillFailure(FailureCode.NOT_LIFTABLE)
+    _check_accessible(body, thing)
+
+
+def check_place_both(body: Body, receptacle: ObjectInstance) -> ObjectInstance:
+    """Preconditions of PlaceBoth; returns what both hands hold."""
+    name = body.lifted
+    if name is None:
+        raise SkillFailure(FailureCode.HAND_EMPTY)
+    _check_receptacle(body, receptacle, name)
+    return body.thing(name)

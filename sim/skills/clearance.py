@@ -1,0 +1,136 @@
+"""What an arm posture would touch, asked on a copy of the simulator's state: nothing moves in the world.
+
+The hand's distance to an object is measured in the world itself, because the grasp depends on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Arm
+from sim.world import World
+
+if TYPE_CHECKING:
+    from sim.skills.body import Body
+
+__all__ = ["TOUCH_M", "ClearanceProbe"]
+
+Array = NDArray[np.float64]
+
+#: Penetration that still counts as touching only.
+TOUCH_M: Final = 0.008
+#: Distance beyond which finger gaps are not measured.
+_FAR_M: Final = 0.2
+
+
+class ClearanceProbe:
+    """Collision questions about arm postures."""
+
+    def __init__(self, world: World, body: Body) -> None:
+        self._world = world
+        self._body = body
+        self._scratch = mujoco.MjData(world.model)
+        model = world.model
+        self._geoms = {arm: _limb_geoms(model, body.spec.arms[arm.value].joints[-2]) for arm in Arm}
+        self._arm_adr = {arm: np.array([int(model.joint(n).qposadr[0]) for n in body.spec.arms[arm.value].joints]) for arm in Arm}
+        self._couplings = [
+            (int(model.jnt_qposadr[model.eq_obj1id[e]]), int(model.jnt_qposadr[model.eq_obj2id[e]]), model.eq_data[e, 4::-1].copy())
+            for e in range(model.neq)
+            if int(model.eq_type[e]) == int(mujoco.mjtEq.mjEQ_JOINT) and model.eq_obj2id[e] >= 0
+        ]
+        self._groups = {
+            arm: tuple(
+                np.array([int(model.geom(name).id) for name in group]) for group in body.spec.arms[arm.value].finger_groups
+            )
+            for arm in Arm
+        }
+
+    def _shape_hand(self, arm: Arm, opening: float) -> None:
+        """Puts the fingers of the copy where a hand of that opening has them, coupled joints included."""
+        model, qpos = self._world.model, self._scratch.qpos
+        spec = self._body.spec.arms[arm.value]
+        for name, opened, closed in zip(spec.hand_joints, spec.hand_open, spec.hand_closed, strict=True):
+            qpos[model.joint(name).qposadr[0]] = closed + opening * (opened - closed)
+        for follower, leader, coefficients in self._couplings:
+            qpos[follower] = np.polyval(coefficients, qpos[leader])
+
+    def depths_m(
+        self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str] = (), opening: float | None = None
+    ) -> Array:
+        """Deepest penetration of forearm and hand into furniture or objects for each arm posture, other joints as they are.
+
+        Args:
+            arm: which one.
+            postures: (A,) arm joints each.
+            ignore: ids of objects that may be touched; whatever is held is ignored too.
+            opening: opening of the hand, None as it is.
+        """
+        world, scratch, model = self._world, self._scratch, self._world.model
+        allowed: set[int] = set()
+        for name, thing in world.objects.items():
+            if thing.held_by or name in ignore:
+                allowed.update(thing.body_ids)
+        scratch.qpos[:] = world.data.qpos
+        if opening is not None:
+            self._shape_hand(arm, opening)
+        mine = self._geoms[arm]
+        depths: list[float] = []
+        for posture in postures:
+            scratch.qpos[self._arm_adr[arm]] = posture
+            mujoco.mj_kinematics(model, scratch)
+            mujoco.mj_collision(model, scratch)
+            count = int(scratch.ncon)
+            worst = 0.0
+            for (a, b), deep in zip(scratch.contact.geom[:count], -scratch.contact.dist[:count], strict=True):
+                if deep <= worst or (int(a) in mine) == (int(b) in mine):
+                    continue
+                other = int(b) if int(a) in mine else int(a)
+                if int(model.geom_bodyid[other]) not in allowed:
+                    worst = float(deep)
+            depths.append(worst)
+        return np.array(depths)
+
+    def free(
+        self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str] = (), opening: float | None = None
+    ) -> bool:
+        """Whether some arm postures at most touch what is around."""
+        return bool(np.all(self.depths_m(arm, postures, ignore, opening) <= TOUCH_M))
+
+    def finger_gaps_m(self, arm: Arm, geoms: NDArray[np.int64]) -> tuple[float, float]:
+        """Distance of each of the two opposing finger groups to some geoms, in the world as it is, negative inside."""
+        gaps = []
+        for group in self._groups[arm]:
+            gaps.append(self.gap_m(group, geoms))
+        return gaps[0], gaps[1]
+
+    def hand_gap_m(self, arm: Arm, geoms: NDArray[np.int64]) -> float:
+        """Distance of the whole hand to some geoms."""
+        return min(self.finger_gaps_m(arm, geoms))
+
+    def gap_m(self, ours: NDArray[np.int64], theirs: NDArray[np.int64]) -> float:
+        """Smallest distance between two sets of geoms."""
+        model, data = self._world.model, self._world.data
+        best = _FAR_M
+        for a in ours:
+            for b in theirs:
+                reach = float(model.geom_rbound[a] + model.geom_rbound[b]) + best
+                if float(np.linalg.norm(data.geom_xpos[a] - data.geom_xpos[b])) > reach:
+                    continue
+                best = min(best, float(mujoco.mj_geomDistance(model, data, int(a), int(b), best, None)))
+        return best
+
+
+def _limb_geoms(model: mujoco.MjModel, joint: str) -> frozenset[int]:
+    """Colliding geoms of the body that a joint moves, and of all below it."""
+    top = int(model.jnt_bodyid[model.joint(joint).id])
+    below = {top}
+    for index in range(top + 1, model.nbody):
+        if int(model.body_parentid[index]) in below:
+            below.add(index)
+    geoms = np.flatnonzero(np.isin(model.geom_bodyid, sorted(below)) & ((model.geom_contype > 0) | (model.geom_conaffinity > 0)))
+    return frozenset(int(index) for index in geoms)

@@ -1,0 +1,225 @@
+"""Where and how a hand can take an object: candidate grasps from the object's box, ordered by preference.
+
+Three families. `wrap`: the fingers pass on both sides of the object, for what fits between them. `rim`: the fingers take the
+edge of a wide vessel. `top`: the fingers come down on the upper side, for what is flat or wide. The pointing direction is
+scanned around the line from the shoulder, because an arm with few degrees of freedom points where it must.
+
+Frames: world. The paper's grasps need no contact; ours are judged by contact afterwards (`sim.skills.manipulate`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Arm
+from sim.objects import ObjectInstance
+from sim.skills.body import Body
+from sim.skills.reach_map import HandPose
+
+__all__ = ["Grasp", "HandShape", "grasp_candidates", "hand_shape"]
+
+Array = NDArray[np.float64]
+_UP: Final = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class HandShape:
+    """Size of an open hand around its grasp site (x along the fingers, y the closing direction).
+
+    Attributes:
+        behind_m: free distance from the site to what closes from behind (site -y): the palm, or one finger.
+        max_radius_m: half the width of the widest object that fits between the fingers.
+        tip_m: how far the open fingers reach beyond the site.
+        half_width_m: half the hand's width across (site z).
+        slope: how the thumb limits the seat: free x per metre of radius, and at radius 0; (0, 0) for parallel fingers.
+        pinch_m: distance along y at which half-closed fingertips and thumb meet a surface; None when the fingers are parallel.
+    """
+
+    behind_m: float
+    max_radius_m: float
+    tip_m: float
+    half_width_m: float
+    slope: tuple[float, float] = (0.0, 0.0)
+    pinch_m: float | None = None
+
+    def seat(self, radius_m: float) -> tuple[float, float]:
+        """Where the middle of an object of that half width belongs: x and y in the site's frame."""
+        forward = self.slope[0] * radius_m + self.slope[1]
+        return (max(forward, 0.0), max(radius_m + 0.007 - self.behind_m, 0.0))
+
+
+#: Hands by robot, measured on their MJCF. H1: palm 38 mm behind the site, thumb opposite at a slant. X1: parallel pads.
+_HANDS: Final = {
+    "h1": HandShape(0.04, 0.055, 0.1, 0.045, slope=(1.9, -0.055), pinch_m=0.016),
+    "x1": HandShape(0.058, 0.054, 0.042, 0.016),
+}
+
+
+def hand_shape(robot_name: str) -> HandShape:
+    """The hand of a robot; robots without an entry are taken to have X1's gripper."""
+    return _HANDS.get(robot_name, _HANDS["x1"])
+
+
+@dataclass(frozen=True, slots=True)
+class Grasp:
+    """One way to take an object.
+
+    Attributes:
+        family: wrap, rim or top.
+        hand: pose of the grasp site at the grasp, world frame.
+        retreat: unit direction in which the hand comes and goes, away from the object.
+        opening: how far the hand is open on arrival.
+    """
+
+    family: str
+    hand: HandPose
+    retreat: Array
+    opening: float = 1.0
+
+
+def _directions(center: Array, shoulder: Array, elevations_deg: tuple[float, ...]) -> Iterator[Array]:
+    """Pointing directions towards a point, nearest the straight line of sight first within each elevation."""
+    flat = center[:2] - shoulder[:2]
+    azimuth = float(np.arctan2(flat[1], flat[0]))
+    for elevation in elevations_deg:
+        for offset in (0.0, 25.0, -25.0, 50.0, -50.0):
+            a, e = azimuth + np.deg2rad(offset), np.deg2rad(elevation)
+            yield np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+
+
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    """The solid box of an object as it lies: centre, axes, half extents, and the point that a hand prefers."""
+
+    center: Array
+    rotation: Array
+    half: Array
+    bottom: float
+    top: float
+    grip: Array
+    has_grip: bool
+
+
+def _shape(body: Body, thing: ObjectInstance) -> _Shape:
+    pose = body.world.pose(thing.object_id)
+    rotation = pose[:3, :3]
+    low, high = solid_box(thing)
+    center = pose[:3, 3] + rotation @ (0.5 * (low + high))
+    half = 0.5 * (high - low)
+    rise = float(np.abs(rotation[2]) @ half)
+    has_grip = "single" in thing.type.grips
+    grip = body.world.grips(thing.object_id)[0] if has_grip else center
+    return _Shape(center, rotation, half, float(center[2]) - rise, float(center[2]) + rise, grip, has_grip)
+
+
+def solid_box(thing: ObjectInstance) -> tuple[Array, Array]:
+    """Bounding box of the parts that can be touched, in the type's frame."""
+    parts = [part for part in thing.type.parts if "ghost" not in part.options]
+    low = np.min([np.subtract(part.center, np.multiply(0.5, part.size)) for part in parts], axis=0)
+    high = np.max([np.add(part.center, np.multiply(0.5, part.size)) for part in parts], axis=0)
+    return low, high
+
+
+def grasp_candidates(body: Body, arm: Arm, thing: ObjectInstance) -> Iterator[Grasp]:
+    """Grasps of an object, most promising first; whether the arm can do them is for the caller to find out."""
+    hand = hand_shape(body.spec.name)
+    shape = _shape(body, thing)
+    shoulder = body.shoulder(arm)
+    yield from _wraps(thing, shape, hand, shoulder)
+    yield from _rims(thing, shape, hand, shoulder)
+    yield from _tops(shape, hand, shoulder)
+
+
+def _wraps(thing: ObjectInstance, shape: _Shape, hand: HandShape, shoulder: Array) -> Iterator[Grasp]:
+    """Fingers on both sides: from the side when the object is tall, from above when it is low."""
+    tall = shape.top - shape.bottom > 0.09
+    elevations = (-35.0, -15.0, -55.0, 0.0, -75.0) if tall else (-60.0, -80.0, -40.0, -25.0)
+    for pointing in _directions(shape.grip, shoulder, elevations):
+        level = np.cross(_UP, pointing)
+        level /= np.linalg.norm(level)
+        closings = [level]
+        if pointing[2] < -0.6:
+            closings += [axis for axis in shape.rotation.T if abs(float(axis[2])) < 0.3 and abs(float(axis @ level)) < 0.97]
+        for closing in closings:
+            if shape.has_grip:
+                radius = 0.5 * _local_width(thing, shape.rotation, closing)
+            else:
+                radius = float(np.abs(shape.rotation.T @ closing) @ shape.half)
+                if len(thing.type.parts) and thing.type.parts[0].shape in ("cylinder", "cup", "ellipsoid", "capsule"):
+                    radius = min(radius, float(np.sort(shape.half)[1]))
+            if radius > hand.max_radius_m:
+                continue
+            forward, aside = hand.seat(radius)
+            drop = max(-float(pointing[2]), 0.0)
+            reach_down = (hand.tip_m - forward) * drop + hand.half_width_m * float(np.sqrt(1.0 - drop * drop)) + 0.008
+            z = max(float(shape.grip[2]), shape.bottom + reach_down)
+            if z > shape.top + 0.25 * (hand.tip_m - forward) * drop - 0.004:
+                continue
+            middle = np.array([shape.grip[0], shape.grip[1], z])
+            for sign in (1.0, -1.0):
+                axis = sign * closing
+                yield Grasp("wrap", HandPose(middle - forward * pointing - aside * axis, pointing, axis), -pointing)
+
+
+def _rims(thing: ObjectInstance, shape: _Shape, hand: HandShape, shoulder: Array) -> Iterator[Grasp]:
+    """Fingers on both sides of the wall of a wide vessel, from above."""
+    hollow = any(part.wall_m > 0.0 for part in thing.type.parts)
+    if not hollow or shape.has_grip or float(np.max(shape.half[:2])) < 0.05 or shape.top - shape.bottom < 0.04:
+        return
+    out = shoulder[:2] - shape.center[:2]
+    start = float(np.arctan2(out[1], out[0]))
+    for turn in (0.0, 60.0, -60.0, 110.0, -110.0, 180.0):
+        angle = start + np.deg2rad(turn)
+        radial = np.array([np.cos(angle), np.sin(angle), 0.0])
+        edge = shape.center + radial * (_extent(shape.rotation, shape.half, radial) - 0.006)
+        for pointing in _directions(edge, shoulder, (-60.0, -80.0, -40.0)):
+            depth = min(0.03, 0.6 * (shape.top - shape.bottom))
+            tip = np.array([edge[0], edge[1], shape.top - depth])
+            forward, aside = hand.seat(0.008)
+            for sign in (1.0, -1.0):
+                axis = sign * radial
+                site = tip - pointing * (hand.tip_m if hand.pinch_m is None else 0.05) - aside * axis
+                yield Grasp("rim", HandPose(site, pointing, axis), -pointing)
+
+
+def _tops(shape: _Shape, hand: HandShape, shoulder: Array) -> Iterator[Grasp]:
+    """Fingertips on the upper side: from above with parallel fingers, palm down and half closed with a five-finger hand."""
+    top = np.array([shape.grip[0], shape.grip[1], shape.top if not shape.has_grip else min(shape.top, shape.grip[2] + 0.02)])
+    if hand.pinch_m is None:
+        for pointing in _directions(top, shoulder, (-70.0, -50.0, -85.0, -30.0)):
+            level = np.cross(_UP, pointing)
+            level /= np.linalg.norm(level)
+            site = top - pointing * (hand.tip_m - 0.004)
+            yield Grasp("top", HandPose(site, pointing, level, either_way=True), -pointing)
+        return
+    for pointing in _directions(top, shoulder, (-25.0, -10.0, -45.0)):
+        closing = -_UP - float(-_UP @ pointing) * pointing
+        closing /= np.linalg.norm(closing)
+        site = top - hand.pinch_m * closing - 0.04 * pointing
+        yield Grasp("top", HandPose(site, pointing, closing), _UP, opening=0.5)
+
+
+def _extent(rotation: Array, half: Array, direction: Array) -> float:
+    """Distance from the middle of a box to its edge along a horizontal direction, at most a round object's radius."""
+    local = np.abs(rotation.T @ direction)
+    reach = np.min(half[local > 0.05] / local[local > 0.05])
+    return float(min(reach, np.max(half)))
+
+
+def _local_width(thing: ObjectInstance, rotation: Array, closing: Array) -> float:
+    """Width of the part that is gripped: of the primitives around the grip point, along the closing direction."""
+    local_closing = np.abs(rotation.T @ closing)
+    grip = np.asarray(thing.type.grips["single"][0])
+    widths = [0.02]
+    for part in thing.type.parts:
+        half = 0.5 * np.asarray(part.size)
+        if "ghost" not in part.options and np.all(np.abs(grip - np.asarray(part.center)) <= half + 0.01):
+            round_part = part.shape in ("cylinder", "capsule", "ellipsoid", "cup")
+            width = float(2.0 * half[:2].max()) if round_part else float(2.0 * local_closing @ half)
+            widths.append(width if part.wall_m == 0.0 else max(part.wall_m, 0.02))
+    return max(widths)

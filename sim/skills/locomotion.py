@@ -1,0 +1,202 @@
+"""Body skills: walk, turn, change pelvis height, go to an object.
+
+The base follows collision-free paths as a disc; the legs keep the soles on the floor (see `sim.robots.leg_ik`). Balance while
+walking is not simulated: the base is driven by servos, which the README states among the limits.
+
+Paper: body actions of the DualTHOR action space. GoTo replaces the paper's teleporting navigation by a planned path.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Action
+from sim.failures import FailureCode, SkillFailure
+from sim.navigation import NavigationMap, Stance, wrap_angle
+from sim.skills.body import Body
+from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.trajectory import plan, plan_polyline
+
+__all__ = ["best_stance", "change_height", "go_to", "move", "rotate"]
+
+WALK_SPEED_M_S: Final = 0.8
+WALK_ACCELERATION_M_S2: Final = 1.6
+TURN_SPEED_RAD_S: Final = 1.8
+TURN_ACCELERATION_RAD_S2: Final = 5.0
+HEIGHT_SPEED_M_S: Final = 0.35
+HEIGHT_ACCELERATION_M_S2: Final = 1.0
+
+#: Heading of a step relative to the robot's own, by action.
+_DIRECTIONS: Final = {"MoveAhead": 0.0, "MoveLeft": np.pi / 2, "MoveBack": np.pi, "MoveRight": -np.pi / 2}
+#: GoTo walks backwards or sideways over ways shorter than this, and turns into the way before longer ones.
+_SIDESTEP_M: Final = 0.5
+#: Preference of near over exact: metres of walking that one metre of deviation from the comfortable distance is worth.
+_DISTANCE_WEIGHT: Final = 6.0
+
+
+def _turn(body: Body, yaw_rad: float) -> Skill:
+    start = body.commanded_base()
+    change = wrap_angle(yaw_rad - start.yaw_rad)
+    yield from _turn_by(body, change)
+
+
+def _turn_by(body: Body, change_rad: float) -> Skill:
+    start = body.commanded_base()
+    ways = plan(np.array([[0.0], [change_rad]]), TURN_SPEED_RAD_S, TURN_ACCELERATION_RAD_S2)
+    time_s = 0.0
+    while time_s < ways.duration_s:
+        time_s += CONTROL_DT_S
+        body.command_base(start.x, start.y, start.yaw_rad + float(ways.at(time_s)[0]))
+        yield
+
+
+def _walk(body: Body, path: NDArray[np.float64], along: bool) -> Skill:
+    """Follows a polyline; `along` turns the heading into the way as it goes, at a bounded rate."""
+    way = plan_polyline(path, WALK_SPEED_M_S, WALK_ACCELERATION_M_S2)
+    yaw = body.commanded_base().yaw_rad
+    time_s = 0.0
+    while time_s < way.duration_s:
+        time_s += CONTROL_DT_S
+        x, y = way.at(time_s)
+        if along:
+            ahead = way.at(time_s + 0.25) - (x, y)
+            if float(np.hypot(*ahead)) > 1e-3:
+                error = wrap_angle(float(np.arctan2(ahead[1], ahead[0])) - yaw)
+                yaw += float(np.clip(4.0 * error, -TURN_SPEED_RAD_S, TURN_SPEED_RAD_S)) * CONTROL_DT_S
+        body.command_base(float(x), float(y), yaw)
+        yield
+
+
+def _settle(body: Body) -> Skill:
+    """Waits until the base has come to rest at its target, at most half a second."""
+    for _ in range(int(0.5 / CONTROL_DT_S)):
+        if body.base_error_m() < 0.004:
+            return
+        yield
+
+
+def move(body: Body, action: Action) -> Skill:
+    """Straight steps ahead, back or sideways; walks as far as the way is free and fails when that is not all of it.
+
+    Raises:
+        SkillFailure: BlockedPath with the metres that were walked.
+    """
+    amount = action.amount if action.amount is not None else float(action.spec.amount_default or 0.0)
+    start = body.commanded_base()
+    angle = start.yaw_rad + _DIRECTIONS[action.name]
+    goal = start.position + amount * np.array([np.cos(angle), np.sin(angle)])
+    free_m = body.navigation().free_travel(start.position, goal)
+    blocked = free_m < amount - 0.01
+    if free_m > 0.01:
+        end = start.position + (goal - start.position) * (free_m / amount)
+        yield from _walk(body, np.stack([start.position, end]), along=False)
+        yield from _settle(body)
+    if blocked:
+        raise SkillFailure(FailureCode.BLOCKED_PATH, {"travel_m": free_m})
+
+
+def rotate(body: Body, action: Action) -> Skill:
+    """Turns on the spot."""
+    degrees = action.amount if action.amount is not None else float(action.spec.amount_default or 0.0)
+    sign = 1.0 if action.name == "RotateLeft" else -1.0
+    yield from _turn_by(body, sign * np.deg2rad(degrees))
+    yield from _settle(body)
+
+
+def change_height(body: Body, action: Action) -> Skill:
+    """MoveUp and MoveDown: bends or stretches the legs, as far as they go.
+
+    Raises:
+        SkillFailure: HeightLimit, with the part of the change that the legs did not allow, when they could do less than asked.
+    """
+    amount = action.amount if action.amount is not None else float(action.spec.amount_default or 0.0)
+    start = body.pelvis_height_m
+    wanted = start + (amount if action.name == "MoveUp" else -amount)
+    low, high = body.spec.pelvis_height_range_m
+    goal = float(np.clip(wanted, low, high))
+    way = plan(np.array([[start], [goal]]), HEIGHT_SPEED_M_S, HEIGHT_ACCELERATION_M_S2)
+    time_s = 0.0
+    while time_s < way.duration_s:
+        time_s += CONTROL_DT_S
+        body.command_height(float(way.at(time_s)[0]))
+        yield
+    yield from _settle(body)
+    if abs(wanted - goal) > 0.005:
+        raise SkillFailure(FailureCode.HEIGHT_LIMIT, {"height_m": wanted - goal})
+
+
+def best_stance(
+    navigation: NavigationMap,
+    start: Stance,
+    target: NDArray[np.float64],
+    comfort_m: tuple[float, float],
+    distance_m: float | None,
+    bearing_rad: float,
+) -> tuple[Stance, NDArray[np.float64]] | None:
+    """The stance for GoTo and the way there.
+
+    Args:
+        navigation: free space.
+        start: current base pose.
+        target: (2,) world position of the object.
+        comfort_m: range of distances the arms like; the middle is preferred.
+        distance_m: distance asked for, None for the most comfortable one that is free.
+        bearing_rad: bearing of the object after arrival.
+
+    Returns:
+        The stance and a polyline (N, 2) to it, None when no free stance can be reached.
+    """
+    if distance_m is not None:
+        rings = [[distance_m], [distance_m - 0.05, distance_m + 0.05]]
+    else:
+        low, high = comfort_m
+        rings = [list(np.arange(low, high + 1e-9, 0.05)), list(np.arange(high + 0.05, 2.0, 0.05))]
+    ways = navigation.ways(start.position)
+    middle = distance_m if distance_m is not None else 0.5 * (comfort_m[0] + comfort_m[1])
+    for ring in rings:
+        stances = navigation.stances(target, [d for d in ring if d > 0.05], bearing_rad)
+        if not stances:
+            continue
+        best: tuple[float, Stance] | None = None
+        for stance in stances:
+            way_m = ways.cost_m(stance.position)
+            off = abs(float(np.linalg.norm(stance.position - target)) - middle)
+            turn = abs(wrap_angle(stance.yaw_rad - start.yaw_rad))
+            cost = way_m + _DISTANCE_WEIGHT * off + 0.1 * turn
+            if np.isfinite(cost) and (best is None or cost < best[0] - 1e-9):
+                best = (cost, stance)
+        if best is not None:
+            path = ways.to(best[1].position)
+            assert path is not None
+            return best[1], path
+    return None
+
+
+def go_to(body: Body, action: Action) -> Skill:
+    """Walks to a free stance near an object and faces it; the pelvis height stays.
+
+    Raises:
+        SkillFailure: NoFreePose.
+    """
+    assert action.object_id is not None
+    target = body.world_position(action.object_id)[:2]
+    bearing = np.deg2rad(action.bearing_deg) if action.bearing_deg is not None else 0.0
+    start = body.commanded_base()
+    found = best_stance(
+        body.navigation(), start, target, body.comfortable_distance_m(), action.amount, bearing
+    )
+    if found is None:
+        raise SkillFailure(FailureCode.NO_FREE_POSE)
+    stance, path = found
+    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    if length > 0.01:
+        along = length > _SIDESTEP_M
+        if along:
+            first = path[min(1, len(path) - 1)] - path[0]
+            yield from _turn(body, float(np.arctan2(first[1], first[0])))
+        yield from _walk(body, path, along)
+    yield from _turn(body, stance.yaw_rad)
+    yield from _settle(body)

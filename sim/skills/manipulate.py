@@ -1,0 +1,292 @@
+"""One-arm skills on movable objects: Pick, Place, ResetArm.
+
+A grasp holds only when both opposing finger groups touch the object, or are within 15 mm of it, after the hand has closed around
+it in physics; only then is the object tied to the hand. Place lowers the object until it touches, opens, and looks whether it
+has come to rest where it should. Every failure brings the arm back to a safe posture first.
+
+Paper: Pick and Place of the DualTHOR action space, there without contact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Action, Arm
+from sim.failures import FailureCode, SkillFailure
+from sim.objects import ObjectInstance
+from sim.skills.body import Body, wait
+from sim.skills.checks import check_pick, check_place
+from sim.skills.grasps import Grasp, grasp_candidates
+from sim.skills.reach import Reach, out_of_reach, plan_reach, route
+from sim.skills.reach_map import HandPose
+from sim.skills.runner import CONTROL_DT_S, Skill
+
+__all__ = ["Luck", "pick", "place", "plan_pick", "plan_place", "reset_arm", "stow"]
+
+Array = NDArray[np.float64]
+
+#: Draws the contingency of an action on an object.
+Luck = Callable[[Action], str]
+
+GRASP_GAP_M: Final = 0.015
+_APPROACH_M: Final = 0.09
+_LIFT_M: Final = 0.06
+_MAX_PLANS: Final = 60
+_UP: Final = np.array([0.0, 0.0, 1.0])
+
+
+def plan_pick(body: Body, arm: Arm, thing: ObjectInstance) -> tuple[Grasp, Reach]:
+    """The grasp and the motion to it.
+
+    Raises:
+        SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
+    """
+    point = body.world.grips(thing.object_id)[0]
+    tried = 0
+    reachable = False
+    for grasp in grasp_candidates(body, arm, thing):
+        if not body.maps[arm.value].contains(body.in_trunk(grasp.hand.position)):
+            continue
+        reachable = True
+        tried += 1
+        if tried > _MAX_PLANS:
+            break
+        reach = plan_reach(body, arm, grasp.hand, grasp.retreat, _APPROACH_M, (thing.object_id,), opening=grasp.opening)
+        if reach is not None:
+            return grasp, reach
+    failure = out_of_reach(body, arm, point)
+    if failure is not None:
+        raise failure
+    raise _height_or(body, arm, point, FailureCode.OBSTRUCTED if reachable else FailureCode.TOO_FAR)
+
+
+def _height_or(body: Body, arm: Arm, point: Array, code: FailureCode) -> SkillFailure:
+    """A reachable point without a collision-free grasp: another height may help when this one is at the envelope's edge."""
+    present = body.pelvis_height_m
+    heights = body.heights_in_reach(arm, point)
+    if heights:
+        middle = 0.5 * (heights[0] + heights[-1])
+        if abs(middle - present) > 0.08:
+            failing = FailureCode.BODY_TOO_HIGH if middle < present else FailureCode.BODY_TOO_LOW
+            return SkillFailure(failing, {"height_m": middle - present})
+    margins = {"gap_m": 0.0} if code is FailureCode.OBSTRUCTED else {"reach_m": 0.0}
+    return SkillFailure(code, margins)
+
+
+def stow(body: Body, arm: Arm, ignore: tuple[str, ...] = ()) -> Skill:
+    """Brings the arm to its ready posture, around what is in the way."""
+    goal = body.ready(arm)
+    way = route(body, arm, body.commanded_arm(arm), goal, ignore)
+    vias = way if way is not None else tuple(body.vias(arm))[:1]
+    yield from body.move_arm(arm, [*vias, goal])
+
+
+def _close(body: Body, arm: Arm, geoms: NDArray[np.int64]) -> Skill:
+    """Closes the hand until both finger groups touch, or it is closed."""
+    steps = 28
+    start = body.hand_opening(arm)
+    for k in range(1, steps + 1):
+        body.command_hand(arm, start * (1.0 - k / steps))
+        yield
+        if k % 2 == 0 and max(body.probe.finger_gaps_m(arm, geoms)) <= 0.002:
+            return
+    yield from wait(0.1)
+
+
+def _retreat(body: Body, arm: Arm, reach: Reach, ignore: tuple[str, ...]) -> Skill:
+    """Opens the hand, backs off along the approach and stows the arm."""
+    yield from body.move_hand(arm, 1.0)
+    yield from body.move_arm(arm, [reach.before])
+    yield from stow(body, arm, ignore)
+
+
+def pick(body: Body, action: Action, luck: Luck) -> Skill:
+    """Pick: takes an object with one hand and carries it before the body.
+
+    Raises:
+        SkillFailure: what `check_pick` and `plan_pick` refuse, GraspMissed, Dropped, or a contingency.
+    """
+    arm = action.arm
+    assert arm is not None and action.object_id is not None
+    thing = body.thing(action.object_id)
+    check_pick(body, arm, thing)
+    grasp, reach = plan_pick(body, arm, thing)
+    name = (thing.object_id,)
+    yield from body.move_hand(arm, grasp.opening, 0.2)
+    yield from body.move_arm(arm, [*reach.way, reach.before])
+    yield from body.move_arm(arm, [reach.at], speed=0.8)
+    yield from wait(0.06)
+    geoms = body.solid_geoms(thing)
+    yield from _close(body, arm, geoms)
+    gaps = body.probe.finger_gaps_m(arm, geoms)
+    if max(gaps) > GRASP_GAP_M:
+        yield from _retreat(body, arm, reach, name)
+        raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": max(gaps)})
+    if thing.held_by:
+        yield from _retreat(body, arm, reach, name)
+        raise SkillFailure(FailureCode.ALREADY_HELD)
+    outcome = luck(action)
+    body.world.attach(arm.value, thing.object_id)
+    yield from _lift(body, arm, grasp, name)
+    if outcome != "success":
+        yield from _bad_luck(body, arm, thing, outcome)
+    yield from stow(body, arm, name)
+    if body.held[arm] != thing.object_id:
+        raise SkillFailure(FailureCode.DROPPED)
+
+
+def _lift(body: Body, arm: Arm, grasp: Grasp, ignore: tuple[str, ...]) -> Skill:
+    """Raises the held object straight up, then draws it back towards the body."""
+    position, _ = body.hand_pose(arm)
+    current = body.commanded_arm(arm)
+    up = body.solve(arm, HandPose(position + _LIFT_M * _UP, grasp.hand.pointing, grasp.hand.closing), start=current)
+    if up.error_m < 0.03:
+        yield from body.move_arm(arm, [up.q])
+    del ignore
+
+
+def _bad_luck(body: Body, arm: Arm, thing: ObjectInstance, outcome: str) -> Skill:
+    """Acts out a contingency of Pick: the object leaves the hand, and may break or lose its liquid."""
+    codes = {"slipped": FailureCode.SLIPPED, "spilled": FailureCode.SPILLED, "broken": FailureCode.BROKE}
+    code = codes.get(outcome, FailureCode.NOTHING_HAPPENED)
+    body.world.detach(arm.value)
+    if outcome in ("spilled", "broken") and thing.type.fillable:
+        body.world.set_state(thing.object_id, "isFilledWithLiquid", False)
+    if outcome == "broken" and thing.type.has("breakable"):
+        body.world.set_state(thing.object_id, "isBroken", True)
+    yield from body.move_hand(arm, 1.0)
+    yield from wait(0.3)
+    yield from stow(body, arm, (thing.object_id,))
+    raise SkillFailure(code, contingency=outcome)
+
+
+def plan_place(body: Body, arm: Arm, thing: ObjectInstance, receptacle: ObjectInstance) -> tuple[Array, Reach, Array]:
+    """Where the held object goes and how the arm brings it there.
+
+    Returns:
+        The spot (3,) on the surface, the motion, and the direction in which the hand leaves.
+
+    Raises:
+        SkillFailure: ReceptacleFull, TooFar, BodyTooHigh, BodyTooLow or Obstructed.
+    """
+    world = body.world
+    position, hand = body.hand_pose(arm)
+    pose = world.pose(thing.object_id)
+    # the object upright again, turned about the vertical only
+    tilt = _upright(pose[:3, :3])
+    offset = tilt @ (pose[:3, 3] - position)  # object frame from the hand
+    pointing, closing = tilt @ hand[:, 0], tilt @ hand[:, 1]
+    lowest = _lowest(thing, tilt @ pose[:3, :3])
+    shoulder = body.shoulder(arm)
+    spots = body.free_spots(thing, receptacle, arm)
+    if not spots:
+        raise SkillFailure(FailureCode.RECEPTACLE_FULL)
+    nearest: Array | None = None
+    for spot in spots:
+        level = spot - offset + (0.0, 0.0, 0.006 - lowest)
+        if nearest is None:
+            nearest = level
+        sight = spot[:2] - shoulder[:2]
+        # keep the hand's azimuth relative to the line of sight, or turn the object a little
+        now = float(np.arctan2(pointing[1], pointing[0])) if np.hypot(*pointing[:2]) > 0.15 else None
+        base_turn = 0.0 if now is None else float(np.arctan2(sight[1], sight[0])) - now
+        for extra in (0.0, 0.35, -0.35, 0.75, -0.75):
+            turn = _turn_z(base_turn + extra)
+            moved = spot + (0.0, 0.0, 0.006 - lowest) - turn @ offset
+            wish = HandPose(moved, turn @ pointing, turn @ closing)
+            reach = plan_reach(
+                body, arm, wish, _UP, 0.08, (thing.object_id, receptacle.object_id), pointing=0.9, closing=0.93
+            )
+            if reach is not None:
+                return spot, reach, -(turn @ pointing)
+    assert nearest is not None
+    failure = out_of_reach(body, arm, nearest)
+    raise failure if failure is not None else _height_or(body, arm, nearest, FailureCode.OBSTRUCTED)
+
+
+def place(body: Body, action: Action, luck: Luck) -> Skill:
+    """Place: puts the held object down on a free spot of a receptacle.
+
+    Raises:
+        SkillFailure: what `check_place` and `plan_place` refuse, PlaceMissed, or a contingency.
+    """
+    arm = action.arm
+    assert arm is not None and action.object_id is not None
+    receptacle = body.thing(action.object_id)
+    thing = check_place(body, arm, receptacle)
+    _, reach, retreat = plan_place(body, arm, thing, receptacle)
+    outcome = luck(action)
+    name = (thing.object_id,)
+    yield from body.move_arm(arm, [*reach.way, reach.before])
+    if outcome in ("nothing", "spilled"):
+        if outcome == "spilled" and thing.type.fillable:
+            body.world.set_state(thing.object_id, "isFilledWithLiquid", False)
+        yield from stow(body, arm, name)
+        raise SkillFailure(
+            FailureCode.SPILLED if outcome == "spilled" else FailureCode.NOTHING_HAPPENED, contingency=outcome
+        )
+    lowering = body.move_arm(arm, [reach.at], speed=0.6)
+    for _ in lowering:
+        yield
+        if body.rests(thing):
+            break
+    yield from wait(0.04)
+    if outcome == "broken" and thing.type.has("breakable"):
+        body.world.set_state(thing.object_id, "isBroken", True)
+    body.world.detach(arm.value)
+    yield from body.move_hand(arm, 1.0)
+    position, hand = body.hand_pose(arm)
+    back = body.solve(arm, HandPose(position + 0.09 * retreat, hand[:, 0], hand[:, 1]), start=body.commanded_arm(arm))
+    yield from body.move_arm(arm, [back.q if back.error_m < 0.03 else reach.before])
+    yield from stow(body, arm, name)
+    for _ in range(int(1.0 / CONTROL_DT_S)):
+        if body.world.speed_of(thing.object_id) < 0.02:
+            break
+        yield
+    if outcome == "broken":
+        raise SkillFailure(FailureCode.BROKE, contingency=outcome)
+    if receptacle.object_id not in body.world.parents(thing.object_id):
+        gap = float(np.linalg.norm(body.world_position(thing.object_id) - body.world_position(receptacle.object_id)))
+        raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})
+
+
+def reset_arm(body: Body, action: Action, luck: Luck) -> Skill:
+    """ResetArm: back to the ready posture, with the hand open unless it holds something.
+
+    Raises:
+        SkillFailure: BothHandsBusy.
+    """
+    del luck
+    assert action.arm is not None
+    if body.lifted is not None:
+        raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
+    if body.held[action.arm] is None:
+        yield from body.move_hand(action.arm, 1.0)
+    yield from stow(body, action.arm)
+
+
+def _turn_z(angle_rad: float) -> Array:
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _upright(rotation: Array) -> Array:
+    """The smallest rotation that makes the object's z axis vertical again."""
+    axis = np.cross(rotation[:, 2], _UP)
+    sine, cosine = float(np.linalg.norm(axis)), float(rotation[2, 2])
+    if sine < 1e-6 or cosine < 0.3:  # upright already, or lying: leave it as it is
+        return np.eye(3)
+    x, y, z = axis / sine
+    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + sine * k + (1.0 - cosine) * (k @ k)
+
+
+def _lowest(thing: ObjectInstance, rotation: Array) -> float:
+    """Height of the lowest corner of the object's box relative to its frame, for an orientation."""
+    corners = np.array([[x, y, z] for x in (thing.local_min[0], thing.local_max[0])
+                        for y in (thing.local_min[1], thing.local_max[1]) for z in (thing.local_min[2], thing.local_max[2])])  # fmt: skip
+    return float((corners @ rotation[2]).min())

@@ -1,0 +1,129 @@
+"""From a wish for the hand to a checked arm motion, or to the failure code that says what is wrong.
+
+A wish that the arm cannot fulfil is told apart by trying other pelvis heights at the same stance: none helps, TooFar; a lower one
+does, BodyTooHigh; a higher one does, BodyTooLow; the present one should do but every motion collides, Obstructed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Arm
+from sim.failures import FailureCode, SkillFailure
+from sim.skills.body import REACH_TOLERANCE_M, ArmGoal, Body
+from sim.skills.clearance import TOUCH_M
+from sim.skills.reach_map import HandPose
+
+__all__ = ["Reach", "out_of_reach", "plan_reach", "route"]
+
+Array = NDArray[np.float64]
+
+#: How well the fingers must agree with the wished directions (cosines) for a grasp to be tried.
+MIN_POINTING: Final = 0.75
+MIN_CLOSING: Final = 0.8
+_PATH_SAMPLES: Final = 6
+_SLIDE_M: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """A checked motion of the hand to a target.
+
+    Attributes:
+        way: (A,) arm postures to pass on the way to `before`.
+        before: (A,) posture short of the target.
+        at: (A,) posture at the target.
+    """
+
+    way: tuple[Array, ...]
+    before: Array
+    at: Array
+
+
+def fulfils(goal: ArmGoal, pointing: float = MIN_POINTING, closing: float = MIN_CLOSING) -> bool:
+    """Whether a solved posture is close enough to its wish."""
+    return goal.error_m <= REACH_TOLERANCE_M and goal.pointing_cos >= pointing and goal.closing_cos >= closing
+
+
+def out_of_reach(body: Body, arm: Arm, point: Array) -> SkillFailure | None:
+    """The failure of reaching for a world point from here, None when the point is within the arm's envelope."""
+    reach_map = body.maps[arm.value]
+    local = body.in_trunk(point)
+    if reach_map.contains(local):
+        return None
+    gap = max(reach_map.beyond_m(local), reach_map.gap_m(local))
+    heights = body.heights_in_reach(arm, point)
+    if not heights:
+        return SkillFailure(FailureCode.TOO_FAR, {"reach_m": gap})
+    present = body.pelvis_height_m
+    nearest = min(heights, key=lambda height: abs(height - present))
+    code = FailureCode.BODY_TOO_HIGH if nearest < present else FailureCode.BODY_TOO_LOW
+    return SkillFailure(code, {"height_m": nearest - present, "reach_m": gap})
+
+
+def route(
+    body: Body, arm: Arm, start: Array, goal: Array, ignore: Iterable[str] = (), opening: float | None = None
+) -> tuple[Array, ...] | None:
+    """Postures to pass between two arm postures without a collision: none, or one with the hand drawn in or raised."""
+    ignore = tuple(ignore)
+    fractions = np.linspace(0.0, 1.0, _PATH_SAMPLES)[:, None]
+    best: tuple[float, tuple[Array, ...]] | None = None
+    for via in (None, *body.vias(arm)):
+        legs = [(start, goal)] if via is None else [(start, via), (via, goal)]
+        samples = np.concatenate([a + fractions * (b - a) for a, b in legs])
+        depths = body.probe.depths_m(arm, samples, ignore, opening)
+        # an arm that touches something at the start may do so until it has come away from it
+        excess = depths - np.concatenate([depths[0] * (1.0 - 0.8 * fractions[:, 0]), np.zeros(len(samples) - _PATH_SAMPLES)])
+        worst = float(excess.max())
+        if worst <= TOUCH_M:
+            return () if via is None else (via,)
+        if best is None or worst < best[0]:
+            best = (worst, () if via is None else (via,))
+    # The hand may slide along what it touches lightly; the servos give way.
+    return best[1] if best is not None and best[0] <= _SLIDE_M else None
+
+
+def plan_reach(
+    body: Body,
+    arm: Arm,
+    wish: HandPose,
+    retreat: Array,
+    distance_m: float,
+    ignore: Sequence[str] = (),
+    pointing: float = MIN_POINTING,
+    closing: float = MIN_CLOSING,
+    opening: float | None = None,
+) -> Reach | None:
+    """A motion to a hand pose that arrives along a straight line, None when there is none.
+
+    Args:
+        body: the robot.
+        arm: which one.
+        wish: hand pose at the target, world frame.
+        retreat: unit direction from the target back to where the straight line starts.
+        distance_m: length of the straight line.
+        ignore: ids of objects that may be touched at the target.
+        pointing, closing: cosines that are demanded.
+        opening: opening of the hand on the way, None as it is.
+    """
+    if not body.maps[arm.value].contains(body.in_trunk(wish.position)):
+        return None
+    at = body.solve(arm, wish)
+    if not fulfils(at, pointing, closing) or not body.probe.free(arm, [at.q], ignore, opening):
+        return None
+    before = None
+    for share in (1.0, 0.6):
+        start = HandPose(wish.position + share * distance_m * retreat, wish.pointing, wish.closing, wish.either_way)
+        before = body.solve(arm, start, start=at.q)
+        if before.error_m <= 2.0 * REACH_TOLERANCE_M and float(np.max(np.abs(before.q - at.q))) < 1.5:
+            break
+        before = None
+    if before is None or not body.probe.free(arm, [before.q], ignore, opening):
+        return None
+    way = route(body, arm, body.commanded_arm(arm), before.q, (), opening)
+    return None if way is None else Reach(way, before.q, at.q)

@@ -1,0 +1,147 @@
+"""What each arm reaches: a table of sampled arm postures with the pose of the hand, and quick questions to it.
+
+Inverse kinematics with few degrees of freedom (H1: five per arm) has local minima and no room for an arbitrary hand orientation.
+The table answers both: for a point it gives the posture whose hand points best, as the start of the solver, and it tells at which
+other pelvis heights the point would be in reach. Sampling is uniform over the joint ranges, with a fixed seed, once per robot.
+
+Frames: `pelvis` is the pelvis heading frame. Shape letters: S samples, A arm joints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sim.robots.kinematics import RobotModel
+from sim.robots.spec import load_robot
+
+__all__ = ["HandPose", "ReachMap", "reach_maps"]
+
+Array = NDArray[np.float64]
+
+_SAMPLES: Final = 60000
+#: A point counts as within the envelope when a sampled hand is at most this far from it.
+_ENVELOPE_M: Final = 0.045
+#: Weight of the position error (per metre) against the orientation error (1 - cosine) when a posture is chosen.
+_POSITION_WEIGHT: Final = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class HandPose:
+    """A wish for the hand.
+
+    Attributes:
+        position: (3,) grasp site in the pelvis frame, metres.
+        pointing: (3,) unit direction of the fingers (site x), or None for any.
+        closing: (3,) unit closing direction (site y), or None for any.
+        either_way: whether the opposite closing direction is as good.
+    """
+
+    position: Array
+    pointing: Array | None = None
+    closing: Array | None = None
+    either_way: bool = False
+
+    def rotation(self, x_axis: Array, y_axis: Array) -> Array:
+        """The wish's (3, 3) rotation; axes it leaves open are taken from a given hand."""
+        x = x_axis if self.pointing is None else self.pointing
+        y = y_axis if self.closing is None else self.closing
+        if self.closing is not None and self.either_way and float(self.closing @ y_axis) < 0.0:
+            y = -y
+        if self.pointing is None and self.closing is not None:
+            x = x - (x @ y) * y
+        x = x / np.linalg.norm(x)
+        y = y - (y @ x) * x
+        y = y / np.linalg.norm(y)
+        return np.stack([x, y, np.cross(x, y)], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class ReachMap:
+    """Sampled postures of one arm.
+
+    Attributes:
+        q: (S, A) joint positions.
+        positions: (S, 3) grasp site in the pelvis frame.
+        x_axes, y_axes: (S, 3) axes of the grasp site.
+        shoulder: (3,) shoulder in the pelvis frame.
+        reach_m: largest distance of the grasp site from the shoulder.
+        tree: nearest-neighbour index over `positions`.
+    """
+
+    q: Array
+    positions: Array
+    x_axes: Array
+    y_axes: Array
+    shoulder: Array
+    reach_m: float
+    tree: cKDTree
+
+    def contains(self, point: Array) -> bool:
+        """Whether the arm can bring its grasp site to (about) a point."""
+        return self.gap_m(point) <= _ENVELOPE_M
+
+    def gap_m(self, point: Array) -> float:
+        """Distance from a point to the nearest sampled hand."""
+        return float(self.tree.query(point)[0])
+
+    def beyond_m(self, point: Array) -> float:
+        """How far a point lies beyond the stretched arm, negative inside."""
+        return float(np.linalg.norm(point - self.shoulder)) - self.reach_m
+
+    def starts(self, wish: HandPose, count: int, radius_m: float = 0.12) -> Array:
+        """(N <= count, A) sampled postures that fulfil a wish best, best first; at least one."""
+        near = np.asarray(self.tree.query_ball_point(wish.position, radius_m), dtype=np.int64)
+        if len(near) == 0:
+            near = np.array([int(self.tree.query(wish.position)[1])])
+        cost = _POSITION_WEIGHT * np.linalg.norm(self.positions[near] - wish.position, axis=1)
+        if wish.pointing is not None:
+            cost = cost + (1.0 - self.x_axes[near] @ wish.pointing)
+        if wish.closing is not None:
+            along = self.y_axes[near] @ wish.closing
+            cost = cost + (1.0 - (np.abs(along) if wish.either_way else along))
+        order = np.argsort(cost, kind="stable")
+        return self.q[near[order[:count]]]
+
+
+@lru_cache(maxsize=4)
+def reach_maps(robot_name: str) -> dict[str, ReachMap]:
+    """The reach maps of a robot's `left` and `right` arm, waist straight."""
+    spec = load_robot(robot_name)
+    robot = RobotModel(spec)
+    rng = np.random.default_rng(20)
+    base = robot.configuration(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), robot.posture())
+    maps: dict[str, ReachMap] = {}
+    columns = {side: robot.indices(arm.joints) for side, arm in spec.arms.items()}
+    slots = {
+        side: np.array([robot.model.joints[robot.model.getJointId(name)].idx_q for name in arm.joints])
+        for side, arm in spec.arms.items()
+    }
+    frames = {side: robot.frame_id(arm.grasp_site) for side, arm in spec.arms.items()}
+    draws = {side: rng.uniform(robot.lower[index], robot.upper[index], (_SAMPLES, len(index))) for side, index in columns.items()}
+    hands = {side: np.empty((_SAMPLES, 3, 3)) for side in spec.arms}  # rows: position, x axis, y axis
+    full = base.copy()
+    for i in range(_SAMPLES):
+        for side in spec.arms:
+            full[slots[side]] = draws[side][i]
+        pin.framesForwardKinematics(robot.model, robot.data, full)
+        for side in spec.arms:
+            pose = robot.data.oMf[frames[side]]
+            hands[side][i, 0] = pose.translation
+            hands[side][i, 1:] = pose.rotation[:, :2].T
+    for side in spec.arms:
+        pin.framesForwardKinematics(robot.model, robot.data, base)
+        shoulder = robot.data.oMf[robot.frame_id(spec.key_bodies[f"{side}_shoulder"])].translation.copy()
+        positions = hands[side][:, 0].copy()
+        sensible = positions[:, 0] > -0.05  # hands behind the back are of no use
+        reach = float(np.linalg.norm(positions - shoulder, axis=1).max())
+        kept = positions[sensible]
+        x_axes, y_axes = hands[side][sensible, 1], hands[side][sensible, 2]
+        maps[side] = ReachMap(draws[side][sensible], kept, x_axes, y_axes, shoulder, reach, cKDTree(kept))
+    return maps
