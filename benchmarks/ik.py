@@ -1,8 +1,8 @@
 """Inverse kinematics: success, residuals and time per solve of both robots. `python benchmarks/ik.py [--count N] [--out FILE]`.
 
 Two sets of targets. `sampled`: grasp poses of random arm postures in front of the body, so every target has a solution and
-success should be 100 %. `table`: points on a grid over tables in front of the robot, fingers pointing forward and palm sideways,
-as in a side grasp; success is then a property of the robot's reach, and `reached at some height` shows what crouching adds.
+success should be 100 %. `table`: points on a grid over tables in front of the robot, fingers asked to point forward and palm
+sideways, as in a side grasp; success is then a property of the robot's reach, and `at some height` shows what crouching adds.
 """
 
 from __future__ import annotations
@@ -16,11 +16,14 @@ import numpy as np
 
 from sim.robots.build_solver import RobotKit, robot_kit
 from sim.robots.kinematics import root_quaternion
+from sim.robots.reach import reach_over_heights
 from sim.robots.solver import IkResult, ReachTarget, rotation_from_axes
 from sim.robots.spec import SIDES, available_robots
 
 
-def sampled_targets(kit: RobotKit, count: int, rng: np.random.Generator) -> list[tuple[float, dict[str, tuple[np.ndarray, np.ndarray]]]]:
+def sampled_targets(
+    kit: RobotKit, count: int, rng: np.random.Generator
+) -> list[tuple[float, dict[str, tuple[np.ndarray, np.ndarray]]]]:
     """Pelvis height and, per arm, position and rotation of a grasp site that some posture reaches in front of the body."""
     robot, low, high = kit.model, *kit.spec.pelvis_height_range_m
     found = []
@@ -73,24 +76,18 @@ def run_sampled(kit: RobotKit, count: int, arms: tuple[str, ...], mode: str, rng
 
 def run_table(kit: RobotKit) -> dict[str, object]:
     """Left arm over tables: per table height, the fraction of points reached standing and at some pelvis height."""
-    low, high = kit.spec.pelvis_height_range_m
-    heights = np.linspace(high, low, 5)
     rotation = rotation_from_axes(np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0]))
     rows, seconds = {}, []
     for table_m in (0.3, 0.5, 0.7, 0.9, 1.1, 1.3):
         standing = anywhere = total = 0
         for x in np.arange(0.25, 0.61, 0.07):
             for y in (0.0, 0.15, 0.3):
+                begin = time.perf_counter()
+                reach = reach_over_heights(kit, "left", np.array([x, y, table_m + 0.06]), rotation)
+                seconds.append((time.perf_counter() - begin) / len(reach.heights_m))
                 total += 1
-                for i, height in enumerate(heights):
-                    target = ReachTarget(np.array([x, y, table_m + 0.06 - height]), rotation)
-                    begin = time.perf_counter()
-                    result = kit.solver.solve({"left": target}, kit.crouches.at(float(height)).q, pelvis_height_m=float(height))
-                    seconds.append(time.perf_counter() - begin)
-                    if result.success:
-                        standing += i == 0
-                        anywhere += 1
-                        break
+                standing += bool(reach.reached[-1])
+                anywhere += bool(reach.reached.any())
         rows[f"table {table_m:.1f} m"] = {"standing": standing / total, "at some height": anywhere / total}
     return {"reach": rows, "ms_median": 1e3 * float(np.median(seconds)), "ms_p95": 1e3 * float(np.percentile(seconds, 95))}
 

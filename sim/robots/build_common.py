@@ -1,8 +1,9 @@
 """What both robots' MJCF share: collision bits, servo gains, geometry given in world coordinates at the zero pose.
 
-Collision bits of the whole simulator (`contype`/`conaffinity`): furniture and floor 1, movable objects 2, robot hands and forearms 4.
-Hands touch furniture and objects; the robot does not touch itself (self-collision is the inverse kinematics' business) and legs
-and trunk touch nothing, because the base moves on planned free paths.
+Collision bits of the whole simulator (`contype`/`conaffinity`): furniture and floor 1, movable objects 2, robot hands and
+forearms 4. Hands touch furniture and objects; the robot does not touch itself, and legs and trunk touch nothing, because the
+base moves on planned free paths. Geom groups: 2 is seen, 3 is collision only, sites are in group 4. Every body is gravity-
+compensated, as a robot's own controller does, so that servos hold a posture without an offset.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Unitree H1's MJCF: the MuJoCo Menagerie model with reduced visual meshes, plus two five-finger hands.
 
 Kinematics, masses and limits of the body are Menagerie's; wrist, palm and fingers come from Unitree's `h1_with_hand.urdf`
-(`assets/h1_kinematics.csv`), with capsules and boxes in place of the hands' meshes. Coupled finger joints are equality constraints.
+(`assets/h1_kinematics.csv`), with capsules and boxes in place of the hands' meshes. Coupled finger joints are equality
+constraints.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ __all__ = ["build_h1", "reduce_mesh"]
 
 SKIN = [0.16, 0.16, 0.18, 1.0]
 #: Triangles kept per mesh; the Menagerie meshes have 286 k together, which costs 10 x in rendering on a CPU.
-FACES = {"torso_link": 900, "pelvis": 450}
+FACES = {"torso_link": 2000, "pelvis": 450}
 FACES_DEFAULT = 360
 #: Servo stiffness (N m/rad) and force limit (N m) by part of the joint's name; limits are Unitree's.
 SERVOS = {
@@ -57,9 +58,10 @@ def reduce_mesh(vertices: NDArray[np.float64], faces: NDArray[np.int64], target:
         _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
         triangles = triangles[np.sort(first)].astype(np.int32)
         if len(triangles) > target:
-            points, triangles = fast_simplification.simplify(
-                points, triangles, target_reduction=1.0 - target / len(triangles), agg=9
+            simplified = fast_simplification.simplify(
+                points.astype(np.float64), triangles, target_reduction=1.0 - target / len(triangles), agg=9
             )
+            points, triangles = simplified[0].astype(np.float32), simplified[1].astype(np.int32)
         grid_m *= 1.35
     return trimesh.Trimesh(points, triangles, process=True)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 from sim.robots.arm_ik import PerArmSolver
 from sim.robots.crouch_table import CrouchTable
 from sim.robots.kinematics import RobotModel
@@ -13,6 +11,7 @@ from sim.robots.whole_body_ik import WholeBodySolver
 
 __all__ = ["SOLVERS", "RobotKit", "robot_kit"]
 
+_KITS: dict[tuple[str, str, str], RobotKit] = {}
 SOLVERS = {"whole_body": WholeBodySolver, "per_arm": PerArmSolver}
 
 
@@ -26,7 +25,10 @@ class RobotKit:
         self.solver: ArmSolver = SOLVERS[spec.solver](self.model, self.crouches)
 
 
-@lru_cache(maxsize=8)
-def robot_kit(name: str) -> RobotKit:
-    """The kit of a robot by name or path (see `load_robot`)."""
-    return RobotKit(load_robot(name))
+def robot_kit(robot: str | RobotSpec) -> RobotKit:
+    """The kit of a robot, by its description or by name or path (see `load_robot`); one per description and process."""
+    spec = load_robot(robot) if isinstance(robot, str) else robot
+    key = (spec.name, str(spec.mjcf_path), repr(spec))
+    if key not in _KITS:
+        _KITS[key] = RobotKit(spec)
+    return _KITS[key]

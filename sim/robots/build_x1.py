@@ -1,7 +1,7 @@
 """AgiBot X1's MJCF: kinematics, masses and limits from `assets/x1_kinematics.csv`, primitive geometry, two parallel grippers.
 
-The vendor's meshes are not redistributed; shells are capsules and boxes between the joints. The grippers are ours: two fingers on
-slides with 0.06 m of travel each, a palm, and pads.
+The vendor's meshes are not redistributed; shells are capsules and boxes between the joints. The grippers are ours: two fingers
+on slides with 0.06 m of travel each, a palm, and pads.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ FINGER_SERVO = (400.0, 30.0)
 
 def _add_gripper(wrist: mujoco.MjsBody, pose: tuple[np.ndarray, np.ndarray], side: str) -> None:
     """Adds palm, two sliding fingers and the grasp site below the wrist; given in the world at the zero pose (arm hanging)."""
-    origin, rotation = pose
+    rotation = pose[1]
     down, lateral = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
     local_down, local_lateral = rotation.T @ down, rotation.T @ lateral
     contact = {"contype": ROBOT_BIT, "conaffinity": ROBOT_AFFINITY, "friction": list(HAND_FRICTION)}
@@ -52,7 +52,14 @@ def _add_gripper(wrist: mujoco.MjsBody, pose: tuple[np.ndarray, np.ndarray], sid
     base.fullinertia, base.explicitinertial = np.array([3e-4, 3e-4, 3e-4, 0.0, 0.0, 0.0]), True
     box = mujoco.mjtGeom.mjGEOM_BOX
     base.add_geom(
-        name=f"{side}_palm", type=box, size=[0.02, 0.07, 0.025], pos=[0.0, 0.0, 0.0], rgba=list(GREY), mass=0.0, group=2, **contact
+        name=f"{side}_palm",
+        type=box,
+        size=[0.02, 0.07, 0.025],
+        pos=[0.0, 0.0, 0.0],
+        rgba=list(GREY),
+        mass=0.0,
+        group=2,
+        **contact,
     )
     for finger, sign in (("a", 1.0), ("b", -1.0)):
         body = base.add_body(name=f"{side}_finger_{finger}", pos=[0.02, 0.0, 0.0])
@@ -116,14 +123,14 @@ def build_x1(table: Path, target: Path) -> None:
         limb(f"link_{side}_shoulder_yaw", (upper + bend) / 2, bend, 0.038, WHITE)
         limb(f"link_{side}_elbow_pitch", bend, elbow, 0.038, GREY)
         limb(f"link_{side}_elbow_yaw", elbow, wrist, 0.033, WHITE, name=f"{side}_forearm", collides=True)
-        limb(f"link_{side}_wrist_roll", wrist, wrist + [0.0, 0.0, -0.03], 0.028, GREY)
+        limb(f"link_{side}_wrist_roll", wrist, wrist - np.array([0.0, 0.0, 0.03]), 0.028, GREY)
         hip, ankle = at[f"link_{side}_hip_roll"], at[f"link_{side}_ankle_roll"]
         knee_link = "link_lleft_knee_pitch" if side == "left" else "link_right_knee_pitch"
         knee = np.array([0.002, ankle[1], 0.346])
         limb(f"link_{side}_hip_pitch", at[f"link_{side}_hip_pitch"], np.array([0.002, ankle[1], 0.6]), 0.05, GREY)
         limb(f"link_{side}_hip_roll", np.array([0.002, hip[1], hip[2]]), np.array([0.002, ankle[1], 0.5]), 0.05, GREY)
         limb(f"link_{side}_hip_yaw", np.array([0.002, ankle[1], 0.5]), knee, 0.05, WHITE)
-        limb(knee_link, knee, ankle + [0.0, 0.0, 0.03], 0.04, WHITE)
+        limb(knee_link, knee, ankle + np.array([0.0, 0.0, 0.03]), 0.04, WHITE)
         foot = [0.035, float(ankle[1]), 0.0205]
         shell_box(bodies[f"link_{side}_ankle_roll"], pose[f"link_{side}_ankle_roll"], foot, [0.1, 0.04, 0.0205], GREY)
         _add_gripper(bodies[f"link_{side}_wrist_roll"], pose[f"link_{side}_wrist_roll"], side)

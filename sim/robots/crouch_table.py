@@ -30,10 +30,14 @@ class CrouchTable:
         self.heights_m: Array = np.linspace(low, high, round((high - low) / step_m) + 1)
         least = np.array([crouch(robot, float(height)).pelvis_pitch_rad for height in self.heights_m])
         leans = _concave_majorant(self.heights_m, least)
-        solved = [crouch(robot, float(height), lean_rad=float(lean)) for height, lean in zip(self.heights_m, leans, strict=True)]
+        solved = [
+            crouch(robot, float(height), lean_rad=float(lean)) for height, lean in zip(self.heights_m, leans, strict=True)
+        ]
         bad = [f"{c.pelvis_height_m:.3f}" for c in solved if not c.feasible]
         if bad:
-            raise ValueError(f"{robot.spec.name}: pelvis heights {', '.join(bad)} m cannot be held; shrink pelvis_height_range_m")
+            raise ValueError(
+                f"{robot.spec.name}: pelvis heights {', '.join(bad)} m cannot be held; shrink pelvis_height_range_m"
+            )
         self._legs = robot.indices(robot.spec.leg_joints)
         self._leg_table: Array = np.stack([c.q[self._legs] for c in solved])
         self._pitch_table: Array = np.array([c.pelvis_pitch_rad for c in solved])

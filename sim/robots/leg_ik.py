@@ -1,8 +1,8 @@
 """Crouching: legs and trunk lean that put the pelvis at a height with both soles flat and the centre of mass over the feet.
 
-Each leg is solved by damped Gauss-Newton on its sole's pose; the feet are moved fore and aft under the pelvis until the centre of
-mass lies above the middle of the soles, as a standing person does. Where an ankle's limit stops an upright crouch, the pelvis leans
-forward as little as is needed: H1 reaches down to coffee tables only so.
+Each leg is solved by damped Gauss-Newton on its sole's pose; the feet are moved fore and aft under the pelvis until the centre
+of mass lies above the middle of the soles, as a standing person does. Where an ankle's limit stops an upright crouch, the
+pelvis leans forward as little as is needed: H1 reaches down to coffee tables only so.
 """
 
 from __future__ import annotations
@@ -96,7 +96,8 @@ def _crouch_with_lean(robot: RobotModel, pelvis_height_m: float, pitch_rad: floa
 
 def _bent_start(robot: RobotModel, pelvis_height_m: float) -> Array:
     """Legs bent a little the right way round, so that the knees do not start at their singularity."""
-    bend = np.clip(1.2 * (robot.spec.standing_pelvis_height_m - pelvis_height_m) / robot.spec.standing_pelvis_height_m, 0.02, 0.7)
+    standing = robot.spec.standing_pelvis_height_m
+    bend = np.clip(1.2 * (standing - pelvis_height_m) / standing, 0.02, 0.7)
     q = robot.posture()
     for name in robot.spec.leg_joints:
         sign = _pitch_sign(robot, name)

@@ -25,6 +25,12 @@ __all__ = ["PinkCore"]
 
 Array = NDArray[np.float64]
 _DT_S = 0.1
+#: Largest change of a joint in one iteration, and Levenberg-Marquardt damping: both keep far targets from oscillating.
+_STEP_RAD = 0.6
+_LM_DAMPING = 0.1
+#: Posture costs per radian of the joints of targeted arms, and of waist and idle arm, which move only when it pays.
+_POSTURE_COST = 3e-3
+_IDLE_COST = 3e-2
 _MAX_ITERATIONS = 40
 _STALL_M = 2e-5
 _STALL_FRACTION = 4e-3
@@ -61,7 +67,7 @@ class PinkCore:
             reference = self.robot.configuration(root, crouch.q)
             root_id = 1
             reduced = pin.buildReducedModel(self.robot.model, [root_id, *self._locked], reference)
-            reduced.velocityLimit = np.full(reduced.nv, self.robot.spec.max_joint_velocity * 4.0)
+            reduced.velocityLimit = np.full(reduced.nv, _STEP_RAD / _DT_S)
             order = np.array([reduced.joints[reduced.getJointId(name)].idx_q for name in self._full_names])
             if len(self._reduced) > 256:
                 self._reduced.clear()
@@ -131,7 +137,9 @@ class PinkCore:
                 distance[arm][row] = cost
         return {arm: np.argsort(values) for arm, values in distance.items()}
 
-    def _restart(self, warm: Array, lower: Array, upper: Array, ranked: dict[str, NDArray[np.int64]] | None, attempt: int) -> Array:
+    def _restart(
+        self, warm: Array, lower: Array, upper: Array, ranked: dict[str, NDArray[np.int64]] | None, attempt: int
+    ) -> Array:
         """First the carry posture, then for each targeted arm the nearest postures of the bank."""
         if ranked is None:
             base = self.robot.arm_posture(self.robot.posture(), "carry")[self._movable]
@@ -194,13 +202,18 @@ class PinkCore:
                 self.robot.spec.arms[arm].grasp_site,
                 position_cost=1.0,
                 orientation_cost=[roll * 0.3 + 1e-6, pointing * 0.3 + 1e-6, pointing * 0.3 + 1e-6],
-                lm_damping=1e-4,
+                lm_damping=_LM_DAMPING,
             )
             rotation = np.eye(3) if target.rotation is None else target.rotation
             task.set_target(pin.SE3(np.asarray(rotation, dtype=float), np.asarray(target.position, dtype=float)))
             tasks.append(task)
             frame_tasks.append((task, target))
-        posture = PostureTask(cost=3e-3)
+        posture = PostureTask(cost=_POSTURE_COST)
+        cost = np.full(model.nv, _POSTURE_COST)
+        for column, owner in zip(order, self._owner, strict=True):  # revolute joints: positions and velocities share indices
+            if owner not in targets:
+                cost[column] = _IDLE_COST
+        posture.cost = cost
         posture.set_target(full)
         tasks.append(posture)
         if self._balance:
@@ -210,8 +223,11 @@ class PinkCore:
         limits = [ConfigurationLimit(model), VelocityLimit(model)]
         previous, error = np.inf, np.inf
         step = 0
-        for step in range(1, _MAX_ITERATIONS + 1):
-            velocity = pink.solve_ik(configuration, tasks, _DT_S, solver="daqp", damping=1e-8, limits=limits, safety_break=False)
+        while step < _MAX_ITERATIONS:
+            step += 1
+            velocity = pink.solve_ik(
+                configuration, tasks, _DT_S, solver="daqp", damping=1e-8, limits=limits, safety_break=False
+            )
             configuration.integrate_inplace(velocity, _DT_S)
             error = max(float(np.linalg.norm(task.compute_error(configuration)[:3])) for task, _ in frame_tasks)
             if error < 0.1 * tolerance_m or abs(previous - error) < max(_STALL_M, _STALL_FRACTION * error):

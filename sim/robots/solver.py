@@ -1,7 +1,7 @@
 """The seam between skills and inverse kinematics: targets in, joints and residuals out.
 
-`ArmSolver` is what skills, the expert and the failure margins use. Two solvers implement it, as in the paper: `arm_ik.PerArmSolver`
-(X1, each arm alone) and `whole_body_ik.WholeBodySolver` (H1, both arms at once with a balance constraint).
+`ArmSolver` is what skills, the expert and the failure margins use. Two solvers implement it, as in the paper:
+`arm_ik.PerArmSolver` (X1, each arm alone) and `whole_body_ik.WholeBodySolver` (H1, both arms at once, balanced).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the project knows of a robot beyond its MJCF: which joints are arms, legs and hands, where the key bodies are, its limits.
+"""What the project knows of a robot beyond its MJCF: its arms, legs and hands, where the key bodies are, its limits.
 
 A robot is one YAML file (`specs/<name>.yaml`) and one MJCF; `load_robot` validates the file against the MJCF.
 """
@@ -132,8 +132,12 @@ def available_robots() -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=16)
-def load_robot(name: str) -> RobotSpec:
-    """Loads a robot by name, or from the path of a YAML file of the same format.
+def load_robot(name: str, mjcf: str | None = None) -> RobotSpec:
+    """Loads a robot.
+
+    Args:
+        name: name of a built-in robot, or path of a YAML file of the same format.
+        mjcf: path of an MJCF file that replaces the description's own, for example one with the vendor's meshes.
 
     Raises:
         ConfigError: on an unknown name, a bad file, or a joint that the MJCF does not have.
@@ -144,15 +148,18 @@ def load_robot(name: str) -> RobotSpec:
     values = yaml.safe_load(path.read_text(encoding="utf-8"))
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected a mapping")
-    mjcf_path = (path.parent / str(values.get("mjcf", ""))).resolve()
+    mjcf_path = Path(mjcf).resolve() if mjcf is not None else (path.parent / str(values.get("mjcf", ""))).resolve()
     if not mjcf_path.is_file():
-        raise ConfigError(f"{path}: mjcf {values.get('mjcf')!r} not found")
+        raise ConfigError(f"{path}: mjcf {mjcf if mjcf is not None else values.get('mjcf')!r} not found")
     joints = _scalar_joints(mjcf_path)
     spec = build(RobotSpec, {**values, "mjcf_path": mjcf_path, "joints": joints}, where=str(path.name))
     named = [*spec.leg_joints, *spec.waist_joints]
     for arm in spec.arms.values():
         named += [*arm.joints, *arm.hand_joints]
-        sizes = {len(arm.joints), len(arm.rest), len(arm.carry)}, {len(arm.hand_joints), len(arm.hand_open), len(arm.hand_closed)}
+        sizes = (
+            {len(arm.joints), len(arm.rest), len(arm.carry)},
+            {len(arm.hand_joints), len(arm.hand_open), len(arm.hand_closed)},
+        )
         if any(len(size) != 1 for size in sizes):
             raise ConfigError(f"{path}: rest, carry, hand_open and hand_closed need one value per joint of {arm.grasp_site}")
     unknown = [joint for joint in named if joint not in joints]

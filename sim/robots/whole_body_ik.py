@@ -1,7 +1,7 @@
 """Inverse kinematics of H1 as in the paper: one problem for waist and both arms, 4x4 targets, current q and dq, balance.
 
-The centre of mass is a task of the same quadratic program, so that reaching far is paid for by the posture, and a solution whose
-centre of mass leaves the support polygon is not a success. Legs and lean follow the pelvis height (see `leg_ik`).
+The centre of mass is a task of the same quadratic program, so that reaching far is paid for by the posture, and a solution
+whose centre of mass leaves the support polygon is not a success. Legs and lean follow the pelvis height (see `leg_ik`).
 """
 
 from __future__ import annotations

@@ -6,8 +6,9 @@ import pytest
 from configs.validate import ConfigError
 from sim.robots.build_solver import robot_kit
 from sim.robots.kinematics import root_quaternion
+from sim.robots.reach import reach_over_heights
 from sim.robots.solver import ReachTarget, rotation_from_axes
-from sim.robots.spec import SIDES, available_robots
+from sim.robots.spec import SIDES, available_robots, load_robot
 
 
 def _root(kit, height):
@@ -19,7 +20,9 @@ def _random_poses(kit, height, rng):
     q = kit.crouches.at(height).q
     for arm in kit.spec.arms.values():
         index = kit.model.indices(arm.joints)
-        q[index] = np.clip(np.asarray(arm.carry) + rng.uniform(-0.6, 0.6, len(index)), kit.model.lower[index], kit.model.upper[index])
+        q[index] = np.clip(
+            np.asarray(arm.carry) + rng.uniform(-0.6, 0.6, len(index)), kit.model.lower[index], kit.model.upper[index]
+        )
     poses = kit.model.frames(_root(kit, height), q, tuple(kit.spec.arms[side].grasp_site for side in SIDES))
     return dict(zip(SIDES, poses, strict=True))
 
@@ -70,7 +73,9 @@ def test_h1_solves_waist_and_both_arms_and_nothing_else():
     kit = robot_kit("h1")
     q = kit.crouches.at(0.9).q
     poses = _random_poses(kit, 0.9, np.random.default_rng(1))
-    result = kit.solver.solve({arm: ReachTarget.from_pose(poses[arm]) for arm in SIDES}, q, np.zeros(len(q)), pelvis_height_m=0.9)
+    result = kit.solver.solve(
+        {arm: ReachTarget.from_pose(poses[arm]) for arm in SIDES}, q, np.zeros(len(q)), pelvis_height_m=0.9
+    )
     moved = {name for name, a, b in zip(kit.spec.joints, q, result.q, strict=True) if abs(a - b) > 1e-9}
     assert moved <= {*kit.spec.waist_joints, *kit.spec.arms["left"].joints, *kit.spec.arms["right"].joints}
     assert result.balance_margin_m > 0.0
@@ -147,6 +152,24 @@ def test_rotation_from_axes_is_a_rotation():
         assert np.linalg.det(rotation) == pytest.approx(1.0)
         np.testing.assert_allclose(rotation[:, 0], pointing / np.linalg.norm(pointing))
         assert rotation[:, 1] @ closing > 0.0
+
+
+@pytest.mark.parametrize("name", available_robots())
+def test_reach_over_heights(name):
+    kit = robot_kit(name)
+    low, high = kit.spec.pelvis_height_range_m
+    far = reach_over_heights(kit, "left", np.array([2.0, 0.2, 0.8]))
+    assert not far.reached.any() and far.shortfall_m.min() > 0.9
+    z_m = {"h1": 0.5, "x1": 0.42}[name]
+    deep = reach_over_heights(kit, "right", np.array([0.3, -0.2, z_m]))
+    assert deep.reached[0] and not deep.reached[-1] and deep.best_height_m < high
+    easy = reach_over_heights(kit, "left", np.array([0.3, 0.2, high]))
+    assert easy.reached[-1] and easy.best_height_m == high
+    assert far.heights_m[0] == low
+
+
+def test_one_kit_per_description(tmp_path):
+    assert robot_kit("x1") is robot_kit(load_robot("x1"))
 
 
 def test_unknown_robot():

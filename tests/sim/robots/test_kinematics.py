@@ -59,7 +59,8 @@ def test_published_dimensions(name, pelvis_m, shoulder_m, reach_m, mass_kg):
     assert keys["left_shoulder"][1] == pytest.approx(-keys["right_shoulder"][1], abs=2e-3)
     joint_names = (robot.spec.arms["left"].joints[1], robot.spec.arms["left"].joints[3], robot.spec.arms["left"].joints[-1])
     shoulder, elbow, hand = (
-        robot.frames(root, robot.posture(), (robot.model.names[robot.model.getJointId(joint)],))[0, :3, 3] for joint in joint_names
+        robot.frames(root, robot.posture(), (robot.model.names[robot.model.getJointId(joint)],))[0, :3, 3]
+        for joint in joint_names
     )
     assert np.linalg.norm(elbow - shoulder) + np.linalg.norm(hand - elbow) == pytest.approx(reach_m, abs=0.02)
     assert sum(inertia.mass for inertia in robot.model.inertias) == pytest.approx(mass_kg, abs=0.8)

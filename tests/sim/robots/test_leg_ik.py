@@ -16,7 +16,9 @@ def _sole_errors(robot: RobotModel, height: float, pitch: float, q: np.ndarray) 
     """Largest height (m) of a sole's corner above or below the floor, and largest tilt (rad) of a sole."""
     soles = robot.frames(np.array([0.0, 0.0, height, *root_quaternion(0.0, pitch)]), q, ("left_sole", "right_sole"))
     half = robot.spec.foot
-    corners = np.array([[x, y, 0.0] for x in (-half.half_length_m, half.half_length_m) for y in (-half.half_width_m, half.half_width_m)])
+    corners = np.array(
+        [[x, y, 0.0] for x in (-half.half_length_m, half.half_length_m) for y in (-half.half_width_m, half.half_width_m)]
+    )
     heights = np.concatenate([(sole[:3, 3] + corners @ sole[:3, :3].T)[:, 2] for sole in soles])
     return float(np.abs(heights).max()), float(np.arccos(np.clip(soles[:, 2, 2], -1.0, 1.0)).max())
 

@@ -58,6 +58,14 @@ def test_a_robot_of_ones_own(tmp_path):
     assert spec.arms["left"] == load_robot("x1").arms["left"]
 
 
+def test_another_mjcf(tmp_path):
+    other = tmp_path / "other.xml"
+    other.write_text(load_robot("x1").mjcf_path.read_text(encoding="utf-8"), encoding="utf-8")
+    assert load_robot("x1", str(other)).mjcf_path == other.resolve()
+    with pytest.raises(ConfigError, match=r"missing\.xml"):
+        load_robot("x1", str(tmp_path / "missing.xml"))
+
+
 def test_unknown_robot():
     with pytest.raises(ConfigError, match=r"'g1': no such robot; allowed: h1, x1"):
         load_robot("g1")
