@@ -1,0 +1,112 @@
+"""Frozen configuration of evaluation: which planner, on which robot, tasks and luck, and which table to assemble."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from configs.schema.robot import RobotConfig
+
+__all__ = ["CategoryName", "DifficultyName", "EvalConfig", "ExperimentConfig", "ExperimentName", "PlannerConfig", "StartName"]
+
+CategoryName = Literal["all", "single", "optional", "essential"]
+DifficultyName = Literal["easy", "medium", "hard", "natural"]
+StartName = Literal["fixed", "turned"]
+ExperimentName = Literal["main_table", "ablation_table", "replanning_table", "failure_figure", "distribution_figures"]
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """One planner.
+
+    Attributes:
+        name: name in commands, ledgers and tables.
+        kind: `mllm` runs a stored model, `random` draws legal actions, `expert` looks into the simulator (privileged).
+        label: name printed in tables.
+        weights: folder of a stored model; needed for `mllm`.
+        adapter: adapter to activate; None takes the stored model's first.
+        train: command that makes the weights, for the message when they are absent.
+        temperature: 0 takes the most likely token.
+        max_new_tokens: longest reply.
+        image_size: side of the head view in pixels for planners that bring no model; a model brings its own.
+    """
+
+    name: str
+    kind: Literal["mllm", "random", "expert"]
+    label: str
+    weights: str | None = None
+    adapter: str | None = None
+    train: str = ""
+    temperature: float = 0.0
+    max_new_tokens: int = 48
+    image_size: int = 112
+
+    def __post_init__(self) -> None:
+        _require(self.name.isidentifier(), f"planner name {self.name!r} must be an identifier")
+        _require((self.weights is not None) == (self.kind == "mllm"), f"kind {self.kind!r} with weights {self.weights!r}")
+        _require(self.temperature >= 0.0, f"temperature {self.temperature} must not be negative")
+        _require(self.max_new_tokens > 0, f"max_new_tokens {self.max_new_tokens} must be positive")
+
+
+@dataclass(frozen=True)
+class ExperimentConfig:
+    """A table or figure of the paper, assembled from the runs that exist.
+
+    Attributes:
+        name: which one.
+        planners: rows, by planner name.
+        robots: robots shown.
+        difficulties: difficulties shown.
+    """
+
+    name: ExperimentName
+    planners: tuple[str, ...]
+    robots: tuple[str, ...] = ("x1", "h1")
+    difficulties: tuple[DifficultyName, ...] = ("easy",)
+
+
+@dataclass(frozen=True)
+class EvalConfig:
+    """Everything `eval.py` needs.
+
+    Attributes:
+        planner: who plans.
+        robot: which robot acts.
+        difficulty: success of low-level skills: easy 100 %, medium 50 %, hard 20 %, natural as the rules say.
+        category: tasks of one category, or all.
+        trials: episodes per task; the luck and the random streams differ between trials.
+        start: `fixed` starts where the task says, `turned` there with a heading drawn per trial.
+        workers: processes; 0 runs in this one.
+        seed: of the luck, hashed with task, robot and trial.
+        tasks: `benchmark`, or the path of a JSON-lines file of tasks.
+        limit: only the first so many tasks of each category.
+        retries: how often an episode with an infrastructure error is run again.
+        output: folder of all outputs.
+        experiment: assemble this instead of running episodes.
+    """
+
+    planner: PlannerConfig
+    robot: RobotConfig
+    difficulty: DifficultyName = "easy"
+    category: CategoryName = "all"
+    trials: int = 1
+    start: StartName = "fixed"
+    workers: int = 2
+    seed: int = 0
+    tasks: str = "benchmark"
+    limit: int | None = None
+    retries: int = 1
+    output: str = "outputs"
+    experiment: ExperimentConfig | None = None
+
+    def __post_init__(self) -> None:
+        _require(self.trials > 0, f"trials {self.trials} must be positive")
+        _require(0 <= self.workers <= 256, f"workers {self.workers} outside [0, 256]")
+        _require(self.limit is None or self.limit > 0, f"limit {self.limit} must be positive or null")
+        _require(self.retries >= 0, f"retries {self.retries} must not be negative")
+        _require(self.seed >= 0, f"seed {self.seed} must not be negative")

@@ -1,0 +1,64 @@
+"""Evaluates a planner, or assembles one of the paper's tables: `python eval.py planner=proprio robot=h1`."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+os.environ.setdefault("MUJOCO_GL", "egl")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+
+from rich.console import Console
+
+from configs.compose import compose
+from configs.schema.eval import EvalConfig
+from configs.validate import ConfigError, build
+
+__all__ = ["main"]
+
+
+def main(overrides: Sequence[str]) -> int:
+    """Runs the command line.
+
+    Args:
+        overrides: `key=value` pairs of `configs/eval.yaml`.
+
+    Returns:
+        0; 1 when episodes stay without a score or weights are absent; 2 on a wrong key or value.
+    """
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    console = Console(stderr=True, highlight=False)
+    try:
+        cfg = build(EvalConfig, compose("eval", overrides))
+    except ConfigError as error:
+        console.print(f"eval.py: {error}", style="red", markup=False)
+        return 2
+    from proprio_mllm.evaluation.run import evaluate  # loads the simulator; a typo above stops before that
+    from proprio_mllm.planners.protocol import WeightsError
+    from proprio_mllm.report.experiments import assemble
+    from proprio_mllm.report.runs import load_run, write_report
+
+    if cfg.experiment is not None:
+        table, files = assemble(cfg.experiment, Path(cfg.output))
+        console.print("\n".join(f"written: {path}" for path in files), markup=False)
+        if table is not None:
+            table.show()
+        return 0
+    try:
+        folder = evaluate(cfg).folder
+    except (WeightsError, ValueError) as error:
+        console.print(f"eval.py: {error}", style="red", markup=False)
+        return 1 if isinstance(error, WeightsError) else 2
+    run = load_run(folder)
+    table = write_report(run)
+    console.print(f"ledger, summary.json and tables: {folder}", markup=False)
+    table.show()
+    return 0 if run.complete else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

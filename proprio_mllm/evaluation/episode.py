@@ -1,0 +1,236 @@
+"""Runs one episode: a session, a planner, and the record of what became of it.
+
+The loop: show the observation, ask for a step, let the session act it out, until the goals hold, the planner says `Done()`, or
+the step budget is used up. A reply outside the grammar costs a step and comes back as the code `InvalidOutput`. The runner
+keeps history and step count itself, so that invalid replies are part of both.
+
+This is one of the two places of the project that catch every exception (the other is the command line): whatever breaks in
+simulator or planner becomes an infrastructure error, which is recorded and never scored.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from data.records import EpisodeRecord, Feedback, HistoryItem, Observation, Outcome, PlanStep
+from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, attribute
+from proprio_mllm.evaluation.seeds import stream
+from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
+
+__all__ = ["EpisodeKeyFields", "GoalReport", "RunnableSession", "Stats", "Watcher", "run_episode"]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class GoalReport:
+    """Which goals hold.
+
+    Attributes:
+        met: one entry per goal.
+        unmet_objects: ids named in goals that do not hold.
+    """
+
+    met: tuple[bool, ...]
+    unmet_objects: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Stats:
+    """Costs of an episode in the simulated world: base path in metres, seconds, share of arm-steps in which an arm acted."""
+
+    path_length_m: float
+    makespan_s: float
+    arm_utilisation: float
+
+
+class RunnableSession(Protocol):
+    """What the runner needs of a session; `proprio_mllm.evaluation.sessions` gives the simulator's."""
+
+    def reset(self, seed: int) -> Observation:
+        """Starts the session's task anew."""
+        ...
+
+    def step(self, step: PlanStep) -> tuple[Observation, Feedback]:
+        """Acts a plan step out."""
+        ...
+
+    def goals(self) -> GoalReport:
+        """Which goals hold now."""
+        ...
+
+    def stats(self) -> Stats:
+        """Costs so far."""
+        ...
+
+    def relations(self) -> Mapping[str, Sequence[str]]:
+        """What holds of which objects now (`held`, `open`, `on Table_1` …), for audits of a critic."""
+        ...
+
+
+#: Called before every step and once at the end with the observation, and the reply and feedback that led to it.
+Watcher = Callable[[Observation, PlannerReply | None, Feedback | None], None]
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeKeyFields:
+    """The fields of a record that are known before the episode."""
+
+    planner: str
+    robot: str
+    task: str
+    category: str
+    difficulty: str
+    trial: int
+    seed: int
+    config_hash: str
+
+
+def run_episode(
+    open_session: Callable[[], RunnableSession],
+    planner: Planner,
+    fields: EpisodeKeyFields,
+    instruction: str,
+    step_budget: int,
+    luck: int,
+    watch: Watcher | None = None,
+) -> EpisodeRecord:
+    """Runs an episode to its end.
+
+    Args:
+        open_session: makes the session; called inside the guarded part.
+        planner: who plans.
+        fields: the episode's key.
+        instruction: the task's instruction.
+        step_budget: steps allowed.
+        luck: the episode's seed (`seeds.episode_seed`), for the session and the planner's random stream.
+        watch: sees every observation.
+
+    Returns:
+        The record; on any exception one with the outcome `INFRASTRUCTURE_ERROR` and the error's text.
+    """
+    started = time.perf_counter()
+    tally = _Tally()
+    try:
+        session = open_session()
+        observation = session.reset(luck)
+        planner.reset(TaskInfo(instruction, fields.robot, step_budget), stream(luck, "planner"))
+        done = _loop(session, planner, observation, step_budget, tally, watch)
+        goals, stats = session.goals(), session.stats()
+    except Exception as error:  # noqa: BLE001  # an episode must never end the run; the record tells what happened
+        logger.warning("%s on %s, trial %d: %s", fields.planner, fields.task, fields.trial, error)
+        message = "".join(traceback.format_exception(error))[-2000:]
+        return _record(fields, tally, time.perf_counter() - started, message=message)
+    success = all(goals.met)
+    return dataclasses.replace(
+        _record(fields, tally, time.perf_counter() - started),
+        outcome=Outcome.SUCCESS if success else Outcome.FAILURE,
+        failure=None if success else attribute(tally.trace, goals.unmet_objects),
+        budget_exhausted=not success and not done,
+        goal_conditions_met=sum(goals.met) / len(goals.met),
+        makespan_s=round(stats.makespan_s, 3),
+        path_length_m=round(stats.path_length_m, 3),
+        arm_utilisation=round(stats.arm_utilisation, 4),
+    )
+
+
+class _Tally:
+    """Running sums of an episode."""
+
+    def __init__(self) -> None:
+        self.trace: list[dict[str, Any]] = []
+        self.invalid = 0
+        self.calls = 0
+        self.tokens = 0
+        self.planner_s = 0.0
+
+
+def _loop(
+    session: RunnableSession,
+    planner: Planner,
+    observation: Observation,
+    step_budget: int,
+    tally: _Tally,
+    watch: Watcher | None,
+) -> bool:
+    """Steps until the end; returns whether the planner ended the episode itself."""
+    history: list[HistoryItem] = []
+    reply: PlannerReply | None = None
+    feedback: Feedback | None = None
+    ended = False
+    for number in range(step_budget):
+        shown = _shown(observation, history, number, step_budget)
+        if watch is not None:
+            watch(shown, reply, feedback)
+        reply = planner.step(shown, feedback)
+        tally.calls += 1
+        tally.tokens += reply.tokens
+        tally.planner_s += reply.latency_s
+        if reply.step is None:
+            feedback = None
+            tally.invalid += 1
+            text = " ".join(reply.text.split())[:80]
+            history.append(HistoryItem(text, f"{text} {INVALID_OUTPUT}".strip()))
+            tally.trace.append(_invalid(reply))
+            continue
+        observation, feedback = session.step(reply.step)
+        history.append(HistoryItem(reply.step.to_text(), feedback.to_text()))
+        tally.trace.append(_traced(reply.step, feedback))
+        ended = any(action.name == "Done" for action in reply.step.actions)
+        if ended or all(session.goals().met):
+            break
+    if watch is not None:
+        watch(_shown(observation, history, len(tally.trace), step_budget), reply, feedback)
+    return ended
+
+
+def _shown(observation: Observation, history: list[HistoryItem], step: int, step_budget: int) -> Observation:
+    return dataclasses.replace(observation, history=tuple(history), step=step, step_budget=step_budget)
+
+
+def _invalid(reply: PlannerReply) -> dict[str, Any]:
+    outcome = {"action": "", "ok": False, "code": INVALID_OUTPUT, "category": "logical", "margins": {}, "contingency": ""}
+    return {"step": reply.text[:400], "outcomes": [outcome | {"message": reply.error[:200]}], "duration_s": 0.0}
+
+
+def _traced(step: PlanStep, feedback: Feedback) -> dict[str, Any]:
+    outcomes = [
+        {
+            "action": outcome.action.to_text(),
+            "ok": outcome.success,
+            "code": outcome.code,
+            "category": None if outcome.category is None else outcome.category.value,
+            "margins": {name: round(float(value), 4) for name, value in outcome.margins.items()},
+            "contingency": outcome.contingency,
+        }
+        for outcome in feedback.outcomes
+    ]
+    return {"step": step.to_text(), "outcomes": outcomes, "duration_s": round(float(feedback.duration_s), 3)}
+
+
+def _record(fields: EpisodeKeyFields, tally: _Tally, wall_s: float, message: str = "") -> EpisodeRecord:
+    trace: tuple[Mapping[str, object], ...] = tuple(tally.trace)
+    return EpisodeRecord(
+        **dataclasses.asdict(fields),
+        outcome=Outcome.INFRASTRUCTURE_ERROR,
+        failure=None,
+        invalid_output=tally.invalid,
+        budget_exhausted=False,
+        goal_conditions_met=0.0,
+        steps=len(tally.trace),
+        makespan_s=0.0,
+        path_length_m=0.0,
+        arm_utilisation=0.0,
+        planner_calls=tally.calls,
+        planner_tokens=tally.tokens,
+        planner_s=round(tally.planner_s, 4),
+        wall_s=round(wall_s, 3),
+        trace=trace,
+        message=message,
+    )

@@ -1,0 +1,131 @@
+"""The ledger: one JSON line per finished episode, appended and flushed to disk at once.
+
+A run that is killed at any moment loses at most the episodes that were under way. A line that was cut short is dropped on
+opening. Episodes are known by their key, so a second run does only what is missing. Infrastructure errors are kept as lines,
+but they do not count as done: they are run again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+from data.records import EpisodeRecord, FailureCategory, Outcome
+
+__all__ = ["LEDGER_VERSION", "EpisodeKey", "Ledger", "LedgerError", "key_of", "read_ledger", "scored"]
+
+LEDGER_VERSION: Final = 1
+
+#: (planner, robot, task, difficulty, trial, seed, config hash)
+EpisodeKey = tuple[str, str, str, str, int, int, str]
+
+
+class LedgerError(ValueError):
+    """A ledger line that cannot be read; the message names file and line."""
+
+
+def key_of(record: EpisodeRecord) -> EpisodeKey:
+    """What makes an episode the same one."""
+    return (
+        record.planner,
+        record.robot,
+        record.task,
+        record.difficulty,
+        record.trial,
+        record.seed,
+        record.config_hash,
+    )
+
+
+def to_json(record: EpisodeRecord) -> dict[str, Any]:
+    """Plain form of a record, with the ledger's version."""
+    return {"version": LEDGER_VERSION, **dataclasses.asdict(record)}
+
+
+def from_json(raw: Mapping[str, Any]) -> EpisodeRecord:
+    """Reads `to_json` back.
+
+    Raises:
+        LedgerError: on another version, or missing or unknown fields.
+    """
+    values = dict(raw)
+    version = values.pop("version", None)
+    if version != LEDGER_VERSION:
+        raise LedgerError(f"ledger version {version!r} is unknown; this code reads {LEDGER_VERSION}")
+    names = {f.name for f in dataclasses.fields(EpisodeRecord)}
+    if set(values) != names:
+        raise LedgerError(f"missing fields {sorted(names - set(values))}, unknown fields {sorted(set(values) - names)}")
+    values["outcome"] = Outcome(values["outcome"])
+    values["failure"] = None if values["failure"] is None else FailureCategory(values["failure"])
+    values["trace"] = tuple(values["trace"])
+    return EpisodeRecord(**values)
+
+
+def read_ledger(path: Path) -> list[EpisodeRecord]:
+    """Records of a ledger in the order they were written; a last line without an end is left out.
+
+    Raises:
+        LedgerError: on a line that is complete but not a record.
+    """
+    if not path.is_file():
+        return []
+    records: list[EpisodeRecord] = []
+    lines = path.read_bytes().split(b"\n")[:-1]  # what follows the last line end was cut short
+    for number, line in enumerate(lines, start=1):
+        try:
+            records.append(from_json(json.loads(line)))
+        except (ValueError, TypeError, AttributeError) as error:
+            raise LedgerError(f"{path}, line {number}: {error}") from error
+    return records
+
+
+def scored(records: Iterable[EpisodeRecord]) -> dict[EpisodeKey, EpisodeRecord]:
+    """The episodes that count, by key: the first score of a key stands, infrastructure errors never do."""
+    found: dict[EpisodeKey, EpisodeRecord] = {}
+    for record in records:
+        if record.outcome is not Outcome.INFRASTRUCTURE_ERROR:
+            found.setdefault(key_of(record), record)
+    return found
+
+
+class Ledger:
+    """Appends to a ledger file; one process writes.
+
+    Args:
+        path: made with its folder when absent; a line that was cut short is removed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_file():
+            content = path.read_bytes()
+            whole = content.rfind(b"\n") + 1
+            if whole != len(content):
+                with path.open("r+b") as handle:
+                    handle.truncate(whole)
+        self._handle = path.open("ab")
+
+    def append(self, record: EpisodeRecord) -> None:
+        """Writes one record and waits until it is on the disk."""
+        line = json.dumps(to_json(record), ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+        self._handle.write(line.encode() + b"\n")
+        self._handle.flush()
+        os.fsync(self._handle.fileno())
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._handle.close()
+
+    def __enter__(self) -> Self:
+        """The ledger itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Closes the file."""
+        self.close()

@@ -1,0 +1,123 @@
+"""Episodes on several processes: each worker has its own simulator, planner and one thread.
+
+Measured on two shared cores, one model per worker beats batching the model in one process: physics and rendering take most of
+an episode, and a small model on one thread needs no batch. Workers are spawned, never forked, because torch and GL are
+loaded. Rows of a batch of one do not depend on what else runs, so results do not depend on the number of workers.
+
+A worker that dies takes its pool with it; the pool is made anew, and an episode that was under way when that happened more than
+`retries` times becomes an infrastructure error.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Any, Generic, Protocol, TypeVar
+
+__all__ = ["Worker", "run_jobs"]
+
+logger = logging.getLogger(__name__)
+
+J = TypeVar("J")
+R = TypeVar("R")
+J_contra = TypeVar("J_contra", contravariant=True)
+R_co = TypeVar("R_co", covariant=True)
+
+
+class Worker(Protocol[J_contra, R_co]):
+    """Does one job after the other; made once per process."""
+
+    def __call__(self, job: J_contra) -> R_co:
+        """The result of a job."""
+        ...
+
+
+_worker: Any = None
+
+
+def _start(make: Callable[[], Any], threads: int) -> None:
+    global _worker
+    os.environ["OMP_NUM_THREADS"] = str(threads)
+    _worker = make()
+
+
+def _do(job: Any) -> Any:
+    return _worker(job)
+
+
+@dataclass
+class _Attempt(Generic[J]):
+    job: J
+    number: int = 1
+
+
+def run_jobs(
+    make: Callable[[], Worker[J, R]],
+    jobs: Sequence[J],
+    workers: int,
+    failed: Callable[[R], bool],
+    lost: Callable[[J, str], R],
+    retries: int = 1,
+) -> Iterator[R]:
+    """Results in the order they are ready.
+
+    Args:
+        make: makes a worker; must be picklable unless `workers` is 0.
+        jobs: what is to be done, in the order it is started.
+        workers: processes; 0 does everything here.
+        failed: whether a result is worth another attempt. Every attempt's result is given out.
+        lost: the result of a job whose process died too often, with the reason.
+        retries: further attempts per job.
+    """
+    queue = [_Attempt(job) for job in jobs]
+    if workers == 0:
+        worker = make()
+        while queue:
+            attempt = queue.pop(0)
+            result = worker(attempt.job)
+            yield result
+            if failed(result) and attempt.number <= retries:
+                queue.append(_Attempt(attempt.job, attempt.number + 1))
+        return
+    while queue:
+        yield from _run_pool(make, queue, min(workers, len(queue)), failed, lost, retries)
+
+
+def _run_pool(
+    make: Callable[[], Worker[J, R]],
+    queue: list[_Attempt[J]],
+    workers: int,
+    failed: Callable[[R], bool],
+    lost: Callable[[J, str], R],
+    retries: int,
+) -> Iterator[R]:
+    """Works the queue off with one pool; returns early, with a shorter queue, when a process dies."""
+    running: dict[Future[R], _Attempt[J]] = {}
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (make, 1))
+    try:
+        while queue or running:
+            while queue and len(running) < workers:
+                attempt = queue.pop(0)
+                running[pool.submit(_do, attempt.job)] = attempt
+            ready, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in ready:
+                attempt = running[future]
+                result = future.result()
+                del running[future]
+                yield result
+                if failed(result) and attempt.number <= retries:
+                    queue.append(_Attempt(attempt.job, attempt.number + 1))
+    except BrokenProcessPool:
+        logger.warning("a worker process died; starting new ones")
+        for attempt in running.values():
+            if attempt.number <= retries:
+                queue.append(_Attempt(attempt.job, attempt.number + 1))
+            else:
+                yield lost(attempt.job, f"the worker process died in {attempt.number} attempts")
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,235 @@
+"""A whole evaluation: which episodes are planned, which the ledger already has, and running the rest.
+
+Everything that decides an episode's result is in its key: planner, robot, task, difficulty, trial, seed, and a hash over the
+planner's configuration, its weights, the robot's description and the tasks. Running the same command again therefore continues
+where the last run stopped, and a change of weights starts a new folder.
+
+Paper: evaluation protocol (tasks, trials, temperature 0).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from tqdm import tqdm
+
+import configs
+from configs.schema.eval import EvalConfig, PlannerConfig
+from data.records import EpisodeRecord, Outcome
+from proprio_mllm.evaluation.episode import EpisodeKeyFields
+from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledger, scored
+from proprio_mllm.evaluation.pool import run_jobs
+from proprio_mllm.evaluation.seeds import episode_seed
+from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWorker, Opener, WorkerSetup, lost_episode
+from proprio_mllm.planners.protocol import check_weights
+from sim.tasks.task import Task, load_benchmark, read_tasks
+
+__all__ = ["RUN_VERSION", "EvalRun", "evaluate", "plan_episodes", "run_folder", "select_tasks", "weights_digest"]
+
+logger = logging.getLogger(__name__)
+
+RUN_VERSION: Final = 1
+_ROOT: Final = Path(configs.__file__).resolve().parent.parent
+
+
+@dataclass(frozen=True, slots=True)
+class EvalRun:
+    """What an evaluation left behind.
+
+    Attributes:
+        folder: holds `run.json` and `ledger.jsonl`.
+        metadata: contents of `run.json`.
+        records: the planned episodes that are scored, in planned order.
+        broken: infrastructure errors of the planned episodes, every attempt.
+    """
+
+    folder: Path
+    metadata: dict[str, Any]
+    records: tuple[EpisodeRecord, ...]
+    broken: tuple[EpisodeRecord, ...]
+
+
+def weights_folder(path: str) -> Path:
+    """A weights folder as given, or relative to the project when it is not found from here."""
+    folder = Path(path)
+    return folder if folder.exists() or folder.is_absolute() else _ROOT / folder
+
+
+def weights_digest(folder: Path) -> str:
+    """Short hash over the files of a stored model."""
+    digest = hashlib.sha256()
+    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix in (".safetensors", ".json", ".jinja", ".txt")):
+        digest.update(path.relative_to(folder).as_posix().encode())
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:16]
+
+
+def select_tasks(cfg: EvalConfig) -> tuple[Task, ...]:
+    """The tasks of a run: the file's, of the wanted category, the first `limit` of each category.
+
+    Raises:
+        ValueError: when the file is not there or no task is left.
+    """
+    if cfg.tasks == "benchmark":
+        tasks = load_benchmark()
+    elif Path(cfg.tasks).is_file():
+        tasks = read_tasks(Path(cfg.tasks))
+    else:
+        raise ValueError(f"tasks={cfg.tasks!r}: no such file; allowed: benchmark, or the path of a JSON-lines file")
+    chosen: list[Task] = []
+    count: dict[str, int] = {}
+    for task in tasks:
+        count[task.category] = count.get(task.category, 0) + 1
+        if cfg.category in ("all", task.category) and (cfg.limit is None or count[task.category] <= cfg.limit):
+            chosen.append(task)
+    if not chosen:
+        raise ValueError(f"tasks={cfg.tasks!r} has no task of category {cfg.category!r}")
+    return tuple(chosen)
+
+
+def config_hash(cfg: EvalConfig, digest: str) -> str:
+    """Hash of what decides results besides the rest of the episode's key."""
+    planner = dataclasses.asdict(cfg.planner)
+    for name in ("label", "train", "weights"):
+        del planner[name]
+    decides = {"planner": planner, "weights": digest, "robot": dataclasses.asdict(cfg.robot), "start": cfg.start}
+    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _task_key(task: Task) -> str:
+    """A task's id with a hash of its content, so that an edited task is another one."""
+    return hashlib.sha256(json.dumps(task.to_json(), sort_keys=True).encode()).hexdigest()[:6]
+
+
+def plan_episodes(cfg: EvalConfig, tasks: Sequence[Task], digest: str) -> list[EpisodeJob]:
+    """Every episode of a run, in the order of tasks and trials."""
+    own = config_hash(cfg, digest)
+    jobs: list[EpisodeJob] = []
+    for task in tasks:
+        for trial in range(cfg.trials):
+            fields = EpisodeKeyFields(
+                planner=cfg.planner.name,
+                robot=cfg.robot.name,
+                task=task.id,
+                category=task.category,
+                difficulty=cfg.difficulty,
+                trial=trial,
+                seed=cfg.seed,
+                config_hash=f"{own}-{_task_key(task)}",
+            )
+            jobs.append(EpisodeJob(fields, cfg.robot, task, episode_seed(cfg.seed, task.id, cfg.robot.name, trial)))
+    return jobs
+
+
+def run_folder(cfg: EvalConfig, digest: str) -> Path:
+    """Where a run's files go; equal commands share a folder, other weights or settings have their own."""
+    parts = [cfg.planner.name, cfg.robot.name, cfg.difficulty]
+    if cfg.category != "all":
+        parts.append(cfg.category)
+    if cfg.trials != 1:
+        parts.append(f"trials{cfg.trials}")
+    if cfg.limit is not None:
+        parts.append(f"limit{cfg.limit}")
+    if cfg.start != "fixed":
+        parts.append(cfg.start)
+    if cfg.seed != 0:
+        parts.append(f"seed{cfg.seed}")
+    if cfg.tasks != "benchmark":
+        parts.append(Path(cfg.tasks).stem)
+    return Path(cfg.output) / "eval" / "-".join([*parts, config_hash(cfg, digest)[:6]])
+
+
+def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileged: bool) -> dict[str, Any]:
+    return {
+        "version": RUN_VERSION,
+        "planner": cfg.planner.name,
+        "label": cfg.planner.label,
+        "privileged": privileged,
+        "robot": cfg.robot.name,
+        "difficulty": cfg.difficulty,
+        "category": cfg.category,
+        "trials": cfg.trials,
+        "limit": cfg.limit,
+        "start": cfg.start,
+        "seed": cfg.seed,
+        "tasks": cfg.tasks,
+        "weights": cfg.planner.weights,
+        "weights_digest": digest,
+        "config_hash": config_hash(cfg, digest),
+        "command": "python " + " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "planned": [[job.fields.task, job.fields.category, job.fields.trial, job.fields.config_hash] for job in jobs],
+        "config": dataclasses.asdict(cfg),
+    }
+
+
+def _resolved(planner: PlannerConfig) -> tuple[PlannerConfig, str]:
+    """The planner with its weights found, and their digest."""
+    if planner.weights is None:
+        return planner, ""
+    folder = check_weights(weights_folder(planner.weights), planner.train)
+    return dataclasses.replace(planner, weights=str(folder)), weights_digest(folder)
+
+
+def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
+    """Runs what is missing of an evaluation.
+
+    Args:
+        cfg: what to run.
+        opener: opens sessions; the simulator's by default.
+
+    Returns:
+        All planned episodes, those of earlier runs of the same command included.
+
+    Raises:
+        WeightsError: when the planner's weights are absent.
+        ValueError: when there is no task to run.
+    """
+    planner, digest = _resolved(cfg.planner)
+    jobs = plan_episodes(cfg, select_tasks(cfg), digest)
+    folder = run_folder(cfg, digest)
+    folder.mkdir(parents=True, exist_ok=True)
+    metadata = _metadata(cfg, jobs, digest, cfg.planner.kind == "expert")
+    temporary = folder / ".run.json.tmp"
+    temporary.write_text(json.dumps(metadata, indent=1) + "\n", encoding="utf-8")
+    os.replace(temporary, folder / "run.json")
+    path = folder / "ledger.jsonl"
+    with Ledger(path) as ledger:
+        done = set(scored(read_ledger(path)))
+        wanted = [_fields_key(job) for job in jobs]
+        missing = [job for job, key in zip(jobs, wanted, strict=True) if key not in done]
+        if len(missing) < len(jobs):
+            logger.info("%d of %d episodes are already in %s", len(jobs) - len(missing), len(jobs), path)
+        setup = WorkerSetup(planner, cfg.difficulty, cfg.start)
+        make = functools.partial(EpisodeWorker, setup) if opener is None else functools.partial(EpisodeWorker, setup, opener)
+        # Long episodes first, so that the workers finish together.
+        order = sorted(missing, key=lambda job: -job.task.step_budget)
+        title = f"{cfg.planner.name} {cfg.robot.name} {cfg.difficulty}"
+        with tqdm(total=len(jobs), initial=len(jobs) - len(missing), desc=title, unit="episode") as bar:
+            for result in run_jobs(make, order, cfg.workers, _broke, lost_episode, cfg.retries):
+                ledger.append(result.record)
+                if not _broke(result):
+                    bar.update(1)
+    everything = read_ledger(path)
+    scores = scored(everything)
+    keys = set(wanted)
+    broken = [r for r in everything if r.outcome is Outcome.INFRASTRUCTURE_ERROR and key_of(r) in keys]
+    return EvalRun(folder, metadata, tuple(scores[key] for key in wanted if key in scores), tuple(broken))
+
+
+def _broke(result: EpisodeResult) -> bool:
+    return result.record.outcome is Outcome.INFRASTRUCTURE_ERROR
+
+
+def _fields_key(job: EpisodeJob) -> EpisodeKey:
+    f = job.fields
+    return f.planner, f.robot, f.task, f.difficulty, f.trial, f.seed, f.config_hash

@@ -1,0 +1,113 @@
+"""The simulator's session as the episode runner wants it; reused within a worker, by robot, difficulty and image size."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+from configs.schema.eval import DifficultyName, StartName
+from configs.schema.robot import RobotConfig
+from data.records import Feedback, Observation, PlanStep
+from proprio_mllm.evaluation.episode import GoalReport, RunnableSession, Stats
+from proprio_mllm.evaluation.seeds import stream
+from proprio_mllm.planners.protocol import Planner
+from sim.session import Session
+from sim.tasks.task import Task
+
+__all__ = ["SimSession", "open_session", "started"]
+
+_sessions: dict[tuple[RobotConfig, str, int], Session] = {}
+
+
+def started(task: Task, start: StartName, luck: int) -> Task:
+    """The task with the start of an episode.
+
+    Args:
+        task: as the benchmark has it.
+        start: `fixed` leaves it; `turned` draws the heading, in steps of 5 degrees.
+        luck: the episode's seed.
+    """
+    if start == "fixed":
+        return task
+    yaw_deg = 5.0 * float(stream(luck, "start").integers(72))
+    return dataclasses.replace(task, start=dataclasses.replace(task.start, yaw_deg=yaw_deg))
+
+
+class SimSession:
+    """A session with one task.
+
+    Args:
+        session: the simulator's.
+        task: what it is reset to.
+    """
+
+    def __init__(self, session: Session, task: Task) -> None:
+        self.session = session
+        self.task = task
+
+    def reset(self, seed: int) -> Observation:
+        """Starts the task anew."""
+        return self.session.reset(self.task, seed=seed)
+
+    def step(self, step: PlanStep) -> tuple[Observation, Feedback]:
+        """Acts a plan step out."""
+        return self.session.step(step)
+
+    def goals(self) -> GoalReport:
+        """Which goals hold now."""
+        metadata = self.session.world.metadata()
+        met = tuple(goal.holds(metadata) for goal in self.task.goals)
+        unmet = {name for goal, holds in zip(self.task.goals, met, strict=True) if not holds for name in goal.object_ids()}
+        return GoalReport(met, frozenset(unmet))
+
+    def stats(self) -> Stats:
+        """Costs so far."""
+        stats = self.session.stats
+        return Stats(float(stats.path_length_m), float(stats.makespan_s), float(stats.arm_utilisation))
+
+    def relations(self) -> Mapping[str, Sequence[str]]:
+        """What holds of which objects now, from the simulator's metadata."""
+        found: dict[str, list[str]] = defaultdict(list)
+        for entry in self.session.world.metadata()["objects"]:
+            name = entry["objectId"]
+            if entry["isPickedUp"]:
+                found["held"].append(name)
+            if len(entry["heldBy"]) == 2:
+                found["lifted"].append(name)
+            if entry["openable"]:
+                found["open" if entry["isOpen"] else "closed"].append(name)
+            if entry["toggleable"]:
+                found["switched on" if entry["isToggled"] else "switched off"].append(name)
+            for carrier in entry["parentReceptacles"] or ():
+                found[f"on {carrier}"].append(name)
+        return dict(found)
+
+
+def open_session(
+    robot: RobotConfig, difficulty: DifficultyName, start: StartName, task: Task, luck: int, planner: Planner
+) -> RunnableSession:
+    """A session for an episode; a privileged planner is attached to it.
+
+    Args:
+        robot: which robot acts.
+        difficulty: success of low-level skills.
+        start: see `started`.
+        task: the benchmark's task.
+        luck: the episode's seed.
+        planner: who plans.
+    """
+    key = (robot, difficulty, planner.image_size)
+    if key not in _sessions:
+        _sessions[key] = Session(_described(robot), difficulty, planner.image_size)
+    session = _sessions[key]
+    if planner.privileged:
+        from proprio_mllm.evaluation.privileged import ExpertPlanner
+
+        assert isinstance(planner, ExpertPlanner)
+        planner.attach(session)
+    return SimSession(session, started(task, start, luck))
+
+
+def _described(robot: RobotConfig) -> str:
+    return robot.spec or robot.name

@@ -1,0 +1,110 @@
+"""What a planner is: `reset` at the start of an episode, then one reply per observation.
+
+A planner sees `Observation` and `Feedback` and nothing else. What it answers may be text outside the action grammar: the reply
+then carries no step, and the episode runner counts it and gives it back as a failure, it never crashes.
+
+Paper: problem formulation (policy over observation, proprioception and feedback).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from data.records import ActionError, Feedback, Observation, PlanStep
+
+__all__ = ["BatchPlanner", "Planner", "PlannerReply", "TaskInfo", "WeightsError", "check_weights", "parse_reply"]
+
+
+@dataclass(frozen=True, slots=True)
+class TaskInfo:
+    """What a planner is told at the start.
+
+    Attributes:
+        instruction: the task in natural language.
+        robot: robot name.
+        step_budget: steps that the task allows.
+    """
+
+    instruction: str
+    robot: str
+    step_budget: int
+
+
+@dataclass(frozen=True, slots=True)
+class PlannerReply:
+    """One answer.
+
+    Attributes:
+        text: what the planner wrote.
+        step: the plan step it means, None when the text is outside the grammar.
+        error: why there is no step.
+        tokens: tokens read and written, 0 for planners without a language model.
+        latency_s: seconds the planner took.
+    """
+
+    text: str
+    step: PlanStep | None
+    error: str = ""
+    tokens: int = 0
+    latency_s: float = 0.0
+
+
+@runtime_checkable
+class Planner(Protocol):
+    """Plans one episode at a time."""
+
+    #: Whether it looks at the simulator's state; tables mark it.
+    privileged: bool
+    #: Side of the square image it wants to see, pixels.
+    image_size: int
+
+    def reset(self, task: TaskInfo, rng: np.random.Generator) -> None:
+        """Forgets the last episode; `rng` is the only source of randomness of the new one."""
+        ...
+
+    def step(self, observation: Observation, feedback: Feedback | None) -> PlannerReply:
+        """The next plan step; `feedback` is None at the first step and after an invalid reply."""
+        ...
+
+
+@runtime_checkable
+class BatchPlanner(Protocol):
+    """Answers several episodes' observations at once, for models that run in this process."""
+
+    def step_batch(self, observations: Sequence[Observation]) -> list[PlannerReply]:
+        """One reply per observation."""
+        ...
+
+
+class WeightsError(RuntimeError):
+    """A model folder that is not there; the message names it and the command that makes it."""
+
+
+def check_weights(folder: str | Path, train: str) -> Path:
+    """The folder of a stored model.
+
+    Args:
+        folder: where the model should be.
+        train: command that makes it.
+
+    Raises:
+        WeightsError: when there is no stored model.
+    """
+    path = Path(folder)
+    if not (path / "config.json").is_file():
+        raise WeightsError(f"no weights at {path}: make them with `{train}`, or set planner.weights=FOLDER")
+    return path
+
+
+def parse_reply(text: str, tokens: int = 0, latency_s: float = 0.0) -> PlannerReply:
+    """A reply from a planner's text: its first line that is not empty, read as a plan step."""
+    line = next((line.strip() for line in text.splitlines() if line.strip()), "")
+    try:
+        return PlannerReply(text, PlanStep.parse(line), tokens=tokens, latency_s=latency_s)
+    except ActionError as error:
+        return PlannerReply(text, None, str(error), tokens, latency_s)

@@ -1,0 +1,37 @@
+"""All planners that need nothing but an observation, by kind. The privileged expert is made in `proprio_mllm.evaluation`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from configs.schema.eval import PlannerConfig
+from proprio_mllm.planners.protocol import Planner
+from proprio_mllm.planners.random_planner import RandomPlanner
+
+__all__ = ["PLANNERS", "make_planner"]
+
+
+def _mllm(cfg: PlannerConfig) -> Planner:
+    from proprio_mllm.planners.mllm import MllmPlanner  # torch loads only where a model is used
+
+    assert cfg.weights is not None
+    return MllmPlanner.load(cfg.weights, cfg.adapter, cfg.temperature, cfg.max_new_tokens, cfg.train)
+
+
+def _random(cfg: PlannerConfig) -> Planner:
+    return RandomPlanner(cfg.image_size)
+
+
+PLANNERS: Final[Mapping[str, Callable[[PlannerConfig], Planner]]] = {"mllm": _mllm, "random": _random}
+
+
+def make_planner(cfg: PlannerConfig) -> Planner:
+    """The configured planner.
+
+    Raises:
+        ValueError: on a kind that is not made here.
+    """
+    if cfg.kind not in PLANNERS:
+        raise ValueError(f"planner kind {cfg.kind!r} is not made here; allowed: {', '.join(PLANNERS)}")
+    return PLANNERS[cfg.kind](cfg)

@@ -1,0 +1,1 @@
+"""Reports: intervals, tables and figures of runs, ours and the paper's always apart."""

@@ -1,0 +1,134 @@
+"""Intervals for success rates when tasks are the sample.
+
+Trials of one task are correlated: in the paper's tables almost every rate is a multiple of one task, so the effective sample
+size is the number of tasks. Where all trials of each task agree (always so with one trial), the interval is Wilson's over
+tasks; otherwise a cluster bootstrap draws whole tasks. Planners are compared in pairs on the same tasks and luck.
+
+Paper: prints no intervals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+__all__ = ["Comparison", "Interval", "cluster_bootstrap", "compare", "rate_interval", "wilson"]
+
+_DRAWS = 4000
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A rate with its interval, all in [0, 1], and how it was made (`wilson`, `bootstrap`, `none`)."""
+
+    rate: float
+    low: float
+    high: float
+    method: str
+
+
+def wilson(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson's score interval of a proportion.
+
+    With z the normal quantile and p = successes / n, the limits are
+    (p + z²/2n ± z sqrt(p (1 - p) / n + z²/4n²)) / (1 + z²/n).
+
+    Raises:
+        ValueError: when not 0 <= successes <= n with n > 0, or the confidence is outside (0, 1).
+    """
+    if n <= 0 or not 0 <= successes <= n:
+        raise ValueError(f"expected 0 <= successes <= n and n > 0, got {successes} of {n}")
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence {confidence} outside (0, 1)")
+    z = float(stats.norm.ppf(0.5 + confidence / 2))
+    p = successes / n
+    centre = p + z * z / (2 * n)
+    half = z * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
+    scale = 1 + z * z / n
+    # At 0 and n the exact limits are 0 and 1; rounding must not step over them.
+    low = 0.0 if successes == 0 else (centre - half) / scale
+    high = 1.0 if successes == n else (centre + half) / scale
+    return low, high
+
+
+def cluster_bootstrap(
+    clusters: Sequence[Sequence[float]], rng: np.random.Generator, confidence: float = 0.95, draws: int = _DRAWS
+) -> tuple[float, float]:
+    """Percentile interval of the mean over all values when whole clusters are drawn with replacement.
+
+    Args:
+        clusters: values of each task.
+        rng: draws the resamples.
+        confidence: in (0, 1).
+        draws: number of resamples.
+
+    Raises:
+        ValueError: without clusters, or with an empty one.
+    """
+    if not clusters or any(len(cluster) == 0 for cluster in clusters):
+        raise ValueError(f"expected clusters with values, got {[len(cluster) for cluster in clusters]}")
+    sums = np.array([float(np.sum(cluster)) for cluster in clusters])
+    counts = np.array([len(cluster) for cluster in clusters], dtype=float)
+    picked = rng.integers(len(clusters), size=(draws, len(clusters)))
+    means = sums[picked].sum(axis=1) / counts[picked].sum(axis=1)
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(means, [tail, 1 - tail])
+    return float(low), float(high)
+
+
+def rate_interval(by_task: Mapping[str, Sequence[bool]], confidence: float = 0.95) -> Interval:
+    """Success rate over episodes with an interval over tasks.
+
+    Args:
+        by_task: successes of the trials of each task.
+        confidence: in (0, 1).
+    """
+    clusters = [[float(value) for value in by_task[task]] for task in sorted(by_task) if by_task[task]]
+    if not clusters:
+        return Interval(float("nan"), float("nan"), float("nan"), "none")
+    values = [value for cluster in clusters for value in cluster]
+    rate = float(np.mean(values))
+    equal_sizes = len({len(cluster) for cluster in clusters}) == 1
+    if equal_sizes and all(len(set(cluster)) == 1 for cluster in clusters):
+        low, high = wilson(sum(int(cluster[0]) for cluster in clusters), len(clusters), confidence)
+        return Interval(rate, low, high, "wilson")
+    low, high = cluster_bootstrap(clusters, np.random.default_rng(0), confidence)
+    return Interval(rate, low, high, "bootstrap")
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Two planners on the tasks both ran.
+
+    Attributes:
+        tasks: number of common tasks.
+        difference: mean success of the first minus the second, over tasks.
+        low: lower limit of the difference's interval.
+        high: upper limit.
+        p_value: exact sign test (McNemar's with one trial) on the tasks where they differ.
+    """
+
+    tasks: int
+    difference: float
+    low: float
+    high: float
+    p_value: float
+
+
+def compare(a: Mapping[str, Sequence[bool]], b: Mapping[str, Sequence[bool]], confidence: float = 0.95) -> Comparison:
+    """Compares two planners task by task.
+
+    Raises:
+        ValueError: when they share no task.
+    """
+    common = sorted(task for task in a if a[task] and b.get(task))
+    if not common:
+        raise ValueError(f"no common task among {len(a)} and {len(b)}")
+    deltas = [float(np.mean(a[task])) - float(np.mean(b[task])) for task in common]
+    wins, losses = sum(d > 0 for d in deltas), sum(d < 0 for d in deltas)
+    p_value = float(stats.binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
+    low, high = cluster_bootstrap([[d] for d in deltas], np.random.default_rng(0), confidence)
+    return Comparison(len(common), float(np.mean(deltas)), low, high, p_value)

@@ -1,0 +1,121 @@
+"""Tables as Markdown, CSV and terminal output, from the same cells."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from proprio_mllm.report.summary import Row
+
+__all__ = ["Table", "rate_cell", "run_table"]
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A titled grid of text.
+
+    Attributes:
+        title: what it shows.
+        columns: headings.
+        rows: cells, as many as headings.
+        notes: lines below the table.
+
+    Raises:
+        ValueError: when a row has another number of cells.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise ValueError(f"row {row!r} has {len(row)} cells, expected {len(self.columns)}")
+
+    def to_markdown(self) -> str:
+        """The table with its title and notes."""
+        widths = [max(len(cell) for cell in column) for column in zip(self.columns, *self.rows, strict=True)]
+
+        def line(cells: Sequence[str]) -> str:
+            return "| " + " | ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)) + " |"
+
+        rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
+        notes = [f"\n{note}" for note in self.notes]
+        return "\n".join([f"**{self.title}**", "", line(self.columns), rule, *(line(row) for row in self.rows), *notes]) + "\n"
+
+    def to_csv(self) -> str:
+        """Heading and rows."""
+        buffer = io.StringIO()
+        writer = csv.writer(buffer, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows(self.rows)
+        return buffer.getvalue()
+
+    def show(self, console: Console | None = None) -> None:
+        """Prints notes first and the table last, so that a run ends with its rows."""
+        console = console or Console(width=max(120, Console().width), highlight=False)
+        for note in self.notes:
+            console.print(note, style="dim", markup=False)
+        grid = RichTable(title=self.title, title_justify="left", show_edge=False)
+        for number, column in enumerate(self.columns):
+            grid.add_column(column, justify="left" if number == 0 else "right", no_wrap=True)
+        for row in self.rows:
+            grid.add_row(*row)
+        console.print(grid)
+
+
+def rate_cell(row: Row) -> str:
+    """`63.2 [54.7, 70.9] 84/133`, empty without an episode."""
+    if not row.episodes:
+        return ""
+    return f"{100 * row.success_rate:.1f} [{100 * row.low:.1f}, {100 * row.high:.1f}] {row.successes}/{row.episodes}"
+
+
+def _number(value: float, digits: int = 1) -> str:
+    return "" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def run_table(title: str, rows: Sequence[Row], notes: Sequence[str] = ()) -> Table:
+    """The table of one run: one row per category and one for all. Times are left out, so that equal runs give equal tables."""
+    columns = (
+        "category",
+        "success",
+        "% ",
+        "95% interval",
+        "navigation",
+        "body adj.",
+        "logical",
+        "goals met",
+        "budget",
+        "invalid",
+        "steps",
+        "calls",
+        "tokens",
+    )
+    body = [
+        (
+            row.category,
+            f"{row.successes}/{row.episodes}",
+            _number(100 * row.success_rate),
+            f"[{100 * row.low:.1f}, {100 * row.high:.1f}]" if row.episodes else "",
+            str(row.navigation),
+            str(row.body_adjustment),
+            str(row.logical),
+            _number(100 * row.goal_conditions),
+            str(row.budget_exhausted),
+            str(row.invalid_output),
+            _number(row.steps),
+            _number(row.calls),
+            _number(row.tokens, 0),
+        )
+        for row in rows
+    ]
+    return Table(title, columns, tuple(body), tuple(notes))
