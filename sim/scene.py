@@ -7,8 +7,8 @@ Furniture is static, with joints for doors and drawers; movable objects have fre
 a body (`World.attach`). Paper: the DualTHOR scenes; balance control and cloth-like or liquid bodies are left out.
 
 Collision bits (`contype`/`conaffinity`), so that only pairs that matter are tested: static 1/0, movable 2/23, hands and
-forearms 4/3 (set in the robot's MJCF), held object 8/27, held door or drawer 16/0. Static geometry, doors, trunk and legs never meet
-each other; a held object or door does not meet the hands.
+forearms 4/3 (set in the robot's MJCF), held object 8/27, held door or drawer 16/0. Static geometry, doors, trunk and legs never
+meet each other; a held object or door does not meet the hands.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ HELD_DOOR_BITS: Final = (16, 0)
 
 #: Position gain and force limit of the base servos; critically damped through `dampratio`, 20 ms to 30 ms behind their targets.
 _BASE_GAINS: Final = {"base_x": 2.0e5, "base_y": 2.0e5, "base_z": 3.0e5, "base_yaw": 2.5e4, "base_pitch": 2.5e4}
+_ARENA_BYTES: Final = 8 << 20
 _WALLS: Final = ("north", "east", "south", "west")
 _OBJECT_FRICTION: Final = (1.0, 0.01, 0.001)
 _MOVING_MASS_KG: Final = {"hinge": 2.5, "slide": 1.5}
@@ -105,6 +106,8 @@ def build_spec(key: SceneKey) -> mujoco.MjSpec:
     option.iterations = 30
     option.ls_iterations = 10
     option.impratio = 3.0
+    option.enableflags = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    spec.memory = _ARENA_BYTES  # small, because a snapshot copies it
     visual: Any = spec.visual
     visual.headlight.ambient = [0.42, 0.42, 0.42]
     visual.headlight.diffuse = [0.40, 0.40, 0.40]

@@ -1,22 +1,22 @@
 """Exact copies of a world: restoring one and repeating the same commands gives bit-equal results.
 
-A snapshot holds MuJoCo's integration state (positions, velocities, controls, solver warm start, active constraints), the
-parts of the model that the world changes while it runs (grasp constraints, collision bits, colours, masses), every object's
-state, the recorder and the random stream. Paper: undo, redo, save and load of DualTHOR, which drop held objects there.
+A snapshot holds a copy of MuJoCo's data (state, solver warm start, active constraints, contacts, and which objects sleep:
+MuJoCo's state vector alone would wake them), the parts of the model that the world changes while it runs (grasp constraints,
+collision bits, colours, masses), every object's state, the recorder and the random stream. Paper: undo, redo, save and load of
+DualTHOR, which drop held objects there.
 """
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Any, Final
 
 import mujoco
-import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MODEL_FIELDS", "STATE_SIGNATURE", "WorldSnapshot", "read_physics", "write_physics"]
+__all__ = ["MODEL_FIELDS", "WorldSnapshot", "read_physics", "write_physics"]
 
-STATE_SIGNATURE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 #: Arrays of the model that a running world writes to.
 MODEL_FIELDS: Final = (
     "eq_obj1id",
@@ -38,7 +38,7 @@ class WorldSnapshot:
 
     Attributes:
         scene: name of the scene it was taken in; restoring into another one is refused.
-        physics: MuJoCo integration state.
+        physics: copy of MuJoCo's data, about a megabyte.
         model: arrays of `MODEL_FIELDS`.
         objects: per object id its state, holders and openness.
         counters: step counters and pending releases.
@@ -47,7 +47,7 @@ class WorldSnapshot:
     """
 
     scene: str
-    physics: NDArray[np.float64]
+    physics: mujoco.MjData
     model: dict[str, NDArray[Any]]
     objects: dict[str, dict[str, Any]]
     counters: dict[str, Any]
@@ -55,19 +55,13 @@ class WorldSnapshot:
     rng: dict[str, Any]
 
 
-def read_physics(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[NDArray[np.float64], dict[str, NDArray[Any]]]:
-    """Copies of the integration state and of the model's changing arrays."""
-    state = np.empty(mujoco.mj_stateSize(model, STATE_SIGNATURE))
-    mujoco.mj_getState(model, data, state, STATE_SIGNATURE)
-    return state, {name: getattr(model, name).copy() for name in MODEL_FIELDS}
+def read_physics(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[mujoco.MjData, dict[str, NDArray[Any]]]:
+    """Copies of the data and of the model's changing arrays."""
+    return copy.copy(data), {name: getattr(model, name).copy() for name in MODEL_FIELDS}
 
 
-def write_physics(
-    model: mujoco.MjModel, data: mujoco.MjData, physics: NDArray[np.float64], arrays: dict[str, NDArray[Any]]
-) -> None:
-    """Writes them back and recomputes positions, leaving the solver's warm start untouched."""
+def write_physics(model: mujoco.MjModel, data: mujoco.MjData, physics: mujoco.MjData, arrays: dict[str, NDArray[Any]]) -> None:
+    """Writes them back, everything derived included."""
     for name, values in arrays.items():
         getattr(model, name)[...] = values
-    mujoco.mj_setState(model, data, physics, STATE_SIGNATURE)
-    mujoco.mj_forward(model, data)
-    mujoco.mj_setState(model, data, physics, STATE_SIGNATURE)
+    mujoco.mj_copyData(data, model, physics)

@@ -192,12 +192,14 @@ class World:
         carrier.openness = 1.0  # a start in a closed cabinet is allowed; only hands need the door open
         target = None if placement.xy is None else np.asarray(placement.xy, dtype=float)
         spot: NDArray[np.float64] | None = None
+        # An explicit place only has to carry the object: its narrow side may be flush with the edge.
+        narrow = float(np.min(thing.local_max[:2] - thing.local_min[:2])) / 2.0
         for gap in (0.0,) if target is not None else (_HAND_GAP_M, 0.04, 0.01):
             spot = find_free_spot(
                 self.data,
                 self.objects,
                 carrier,
-                thing.footprint_radius_m,
+                thing.footprint_radius_m if target is None else narrow,
                 height_m=thing.height_m,
                 near=target,
                 rng=self.rng,
@@ -213,7 +215,7 @@ class World:
         if target is not None:
             if np.linalg.norm(spot[:2] - target) > 0.03:
                 raise WorldError(
-                    f"{placement.object_id} does not fit at {placement.xy} on {placement.receptacle}; nearest free is {spot[:2]}"
+                    f"{placement.object_id} does not fit at {placement.xy} on {placement.receptacle}; nearest is {spot[:2]}"
                 )
             spot[:2] = target
         half = np.radians(placement.yaw_deg) / 2.0
@@ -684,7 +686,15 @@ class World:
         released = list(self.constraints.released) if self.constraints is not None else []
         counters = {"steps": self._steps, "speeds": dict(self._speeds), "released": released}
         frames = tuple(self.recorder.frames) if self.recorder is not None else ()
-        return WorldSnapshot(repr(self._key), physics, arrays, objects, counters, frames, dict(self.rng.bit_generator.state))
+        return WorldSnapshot(
+            repr(self._key),
+            physics,
+            arrays,
+            objects,
+            counters,
+            frames,
+            dict(self.rng.bit_generator.state),
+        )
 
     def restore(self, snapshot: WorldSnapshot) -> None:
         """Returns to a saved moment.

@@ -63,6 +63,17 @@ def test_saving_changes_nothing() -> None:
     assert _same(_trace(a), _trace(b))
 
 
+def test_sleeping_objects_stay_bit_equal() -> None:
+    world = World(load_robot("x1"), "kitchen_1")
+    world.advance(3.0)
+    snapshot = world.save()
+    first = _trace(world)
+    world.data.qvel[world.object("Mug_1").dof_adr] = 0.5
+    world.advance(0.5)
+    world.restore(snapshot)
+    assert _same(first, _trace(world))
+
+
 def test_other_scenes_are_refused() -> None:
     with pytest.raises(WorldError, match="another scene"):
         World(None, "kitchen_1").restore(World(None, "kitchen_1", [ObjectPlacement("Mug_1", "Shelf_1")]).save())

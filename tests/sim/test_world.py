@@ -101,6 +101,7 @@ def test_steps_of_any_multiple_give_the_same_future() -> None:
 
 def test_attached_object_follows_the_hand_and_is_released(world: World) -> None:
     """Here the mug is put into the hand by the test itself; skills need contact first."""
+    world.advance(3.0)  # long enough for the mug to fall asleep
     mug = world.object("Mug_1")
     hand = world.grasp_pose("right")[:3, 3]
     world.data.qpos[mug.qpos_adr : mug.qpos_adr + 3] = hand - (0.0, 0.0, 0.05)
@@ -134,6 +135,7 @@ def test_attached_object_follows_the_hand_and_is_released(world: World) -> None:
 
 def test_door_follows_the_hand_about_its_hinge() -> None:
     world = World(load_robot("x1"), "kitchen_1", [], start=(-2.2, -0.15, np.pi))
+    world.advance(3.0)
     handle, hand = world.handle("Drawer_1"), world.grasp_pose("right")[:3, 3]
     world.data.ctrl[[world.model.actuator(n).id for n in ("base_x", "base_y", "base_z")]] += handle - hand
     for name, delta in zip(("base_x", "base_y", "base_z"), handle - hand, strict=True):
@@ -280,3 +282,17 @@ def test_diverged_physics_is_an_error() -> None:
     world.data.qvel[:] = 1e9
     with pytest.raises(WorldError, match="diverged"):
         world.advance(0.05)
+
+
+def test_pushing_a_carrier_wakes_what_it_carries() -> None:
+    """Objects at rest sleep; one that loses its support falls."""
+    world = World(
+        load_robot("x1"), "living_room_1", [ObjectPlacement("Apple_1", "Drawer_1")], states={"Drawer_1": {"isOpen": True}}
+    )
+    world.advance(3.0)
+    drawer, before = world.object("Drawer_1").moving[0], world.center("Apple_1")
+    world.data.qfrc_applied[drawer.dof_adr] = -12.0
+    world.advance(0.7)
+    world.data.qfrc_applied[drawer.dof_adr] = 0.0
+    assert world.object("Drawer_1").openness < 0.5
+    assert np.linalg.norm(world.center("Apple_1") - before) > 0.05
