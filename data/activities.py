@@ -1,7 +1,7 @@
 """What the synthetic people do, and the words for it: household movements with directions, heights and named arms.
 
-Each activity adds to a `Script` and returns interchangeable phrases. Wrist points are in the base frame: x forward, y left, z above
-the floor, metres.
+Each activity adds to a `Script` and returns interchangeable phrases. Wrist points are in the base frame: x forward, y left, z
+above the floor, metres.
 
 Paper: none; part of the generator of motions. The vocabulary follows HumanML3D's manner of describing motion.
 """

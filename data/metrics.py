@@ -1,7 +1,7 @@
 """How well a robot follows a human clip: errors, contact, limits, smoothness, balance.
 
-Definitions follow `docs` and common practice: an error is the distance to the method's own targets (after scaling), limb direction
-is scale-free and compares with the human, contact comes from the human's toes.
+Definitions follow `docs` and common practice: an error is the distance to the method's own targets (after scaling), limb
+direction is scale-free and compares with the human, contact comes from the human's toes.
 Shape letters: T frames. Units: cm, degrees, percent of frames; radians for joints.
 
 Paper: none (the paper reports no retargeting quality). Left out: PA-MPJPE.
@@ -46,7 +46,8 @@ class Metrics:
         saturation_pct: joint-frames within 0.01 rad of a limit.
         velocity_pct: frames with a joint faster than the limit.
         jump_pct: frames in which a joint moves by more than 0.2 rad.
-        balance_cm: mean distance of the centre of mass inside the support polygon, in slow double support; nan without such frames.
+        balance_cm: mean distance of the centre of mass inside the support polygon, in slow double support; nan without such
+            frames.
         lowest_pelvis: lowest pelvis as a share of its standing height.
         frames: length of the clip.
     """
@@ -112,8 +113,8 @@ def saturation_pct(q: Array, lower: Array, upper: Array, margin: float = 0.01) -
 
 
 def balance_cm(retargeter: Retargeter, result: Retargeted, soles: Array) -> float:
-    """Mean signed distance (cm) of the centre of mass to the support polygon's edge, over slow frames with both feet planted."""
-    motion = result.motion
+    """Mean signed distance (cm) of the centre of mass to the support polygon's edge, over slow frames with both feet
+    planted.""" motion = result.motion
     assert motion.root_pose is not None
     assert motion.joint_positions is not None
     slow = np.zeros(len(soles), dtype=bool)

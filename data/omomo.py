@@ -1,7 +1,8 @@
-"""Reads real motion capture in two plain formats: OMOMO clips as the holosoma project stores them, and arrays of joint positions.
+"""Reads real motion capture in two plain formats: OMOMO clips as the holosoma project stores them, and arrays of joint
+positions.
 
-The clips come with `make motions` (the package `holosoma-retargeting`, used for its data only). They check the retargeting on real
-people; nothing is trained on them by default.
+The clips come with `make motions` (the package `holosoma-retargeting`, used for its data only). They check the retargeting on
+real people; nothing is trained on them by default.
 
 Paper: none; a check beside HumanML3D. Left out: object poses.
 """

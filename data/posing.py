@@ -1,7 +1,7 @@
 """Poses a human skeleton from a few channels: pelvis, trunk lean, feet on the ground, hands in front of the body.
 
-Legs and arms are two-bone chains solved in closed form; the pelvis is lowered until both legs reach their feet, so that a planted
-foot stays where it is. Everything is vectorised over frames.
+Legs and arms are two-bone chains solved in closed form; the pelvis is lowered until both legs reach their feet, so that a
+planted foot stays where it is. Everything is vectorised over frames.
 Shape letters: T frames. Axes: x forward, y left, z up.
 
 Paper: none; it feeds the generator of motions that stands in where HumanML3D is not at hand.

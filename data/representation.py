@@ -4,13 +4,15 @@ Per frame: root yaw rate (1), root velocity on the floor (2), root height (1), j
 rotations as 6 numbers (126), joint velocities (66), foot contacts (4). A clip of T frames has T - 1 rows. Axes: x left, y up,
 z forward.
 
-Source: HumanML3D (Guo et al., CVPR 2022), `motion_representation.ipynb`. One peculiarity of the published code is kept because the
+Source: HumanML3D (Guo et al., CVPR 2022), `motion_representation.ipynb`. One peculiarity of the published code is kept
+because the
 published vectors have it: its root direction adds the hips' vector with the sign opposite to the shoulders' one.
 Shape letters: T frames.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -24,21 +26,14 @@ __all__ = ["VECTOR_SIZE", "joints_from_vectors", "vectors_from_joints"]
 Array = NDArray[np.float64]
 VECTOR_SIZE: Final = 263
 _CONTACT_SPEED: Final = 0.002  # squared metres per frame
+#: Direction of each bone in the rest pose, by HumanML3D's convention.
 _OFFSETS: Final = np.array(
     [
-        [0, 0, 0],
-        [1, 0, 0],
-        [-1, 0, 0],
-        [0, 1, 0],
-        [0, -1, 0],
-        [0, -1, 0],
-        [0, 1, 0],
-        [0, -1, 0],
-        [0, -1, 0],
-        [0, 1, 0],
-        [0, 0, 1],
-    ]
-    + [[0, 0, 1], [0, 1, 0], [1, 0, 0], [-1, 0, 0], [0, 0, 1], *([[0, -1, 0]] * 6)],
+        *([0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0]),
+        *([0, -1, 0], [0, -1, 0], [0, 1, 0], [0, -1, 0], [0, -1, 0], [0, 1, 0]),
+        *([0, 0, 1], [0, 0, 1], [0, 1, 0], [1, 0, 0], [-1, 0, 0], [0, 0, 1]),
+        *([[0, -1, 0]] * 6),
+    ],
     dtype=np.float64,
 )
 
@@ -111,7 +106,7 @@ def _inverse_kinematics(positions: Array) -> Array:
     rotations[:, 0] = root
     for chain in CHAINS:
         so_far = root
-        for parent, child in zip(chain[:-1], chain[1:], strict=True):
+        for parent, child in pairwise(chain):
             bone = positions[:, child] - positions[:, parent]
             bone /= np.maximum(np.linalg.norm(bone, axis=1, keepdims=True), 1e-9)
             local = _multiply(_inverse(so_far), _between(_OFFSETS[child], bone))

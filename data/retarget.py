@@ -3,9 +3,9 @@
 For each frame, with q the configuration (floating base included), W the weights and r the residuals below, it iterates
 `q <- q ⊕ -(JᵀWJ + λ)⁻¹ JᵀWr`, with joints held at the bounds that joint limits and joint velocity give.
 
-Residuals: place and orientation of both soles (flat, locked during contact), place and orientation of the pelvis (orientation from
-the human trunk, height lowered until both legs reach), and for each arm the vectors shoulder to elbow and elbow to wrist, which are
-the robot's bone lengths along the human's directions. Lengths scale by the ratio of the legs.
+Residuals: place and orientation of both soles (flat, locked during contact), place and orientation of the pelvis (orientation
+from the human trunk, height lowered until both legs reach), and for each arm the vectors shoulder to elbow and elbow to
+wrist, which are the robot's bone lengths along the human's directions. Lengths scale by the ratio of the legs.
 Shape letters: T frames, J joints. Frames: world, z up, floor at 0.
 
 Paper: data preparation, "retargeted to the robot". Left out: hands' orientation, objects, self-collision as a constraint.
@@ -339,8 +339,8 @@ class Retargeter:
 
 
 def _bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) -> Array:
-    """Newton step whose joint part (all but the first six entries) stays within bounds; joints that would leave are held at them."""
-    step = -np.linalg.solve(hessian, gradient)
+    """Newton step whose joint part (all but the first six entries) stays within bounds; joints that would leave are held at
+    them.""" step = -np.linalg.solve(hessian, gradient)
     held = np.zeros(len(step), dtype=bool)
     for _ in range(3):
         joints = step[6:]
@@ -357,7 +357,7 @@ def _bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) -
 
 
 def _length(vectors: Array) -> Array:
-    return np.linalg.norm(vectors, axis=-1)
+    return np.sqrt(np.sum(vectors * vectors, axis=-1))
 
 
 def _unit(vectors: Array) -> Array:
@@ -375,8 +375,8 @@ def _about_z(yaw_rad: Array) -> Array:
 
 
 def _level(rotation: Array) -> Array:
-    """The rotation closest to `rotation` that is reached by a right-angled frame change with the foot flat and pointing along x."""
-    snapped = np.zeros((3, 3))
+    """The rotation closest to `rotation` that is reached by a right-angled frame change with the foot flat and pointing along
+    x.""" snapped = np.zeros((3, 3))
     for column in range(3):
         row = int(np.argmax(np.abs(rotation[:, column])))
         snapped[row, column] = np.sign(rotation[row, column])

@@ -9,6 +9,7 @@ Paper: none; part of the generator of motions.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -206,7 +207,7 @@ def _foot(place: Array, side: int) -> Array:
     )
 
 
-def _path(walk: _Walk, start: Array):  # noqa: ANN202 - a small closure
+def _path(walk: _Walk, start: Array) -> Callable[[float], Array]:
     """Place (x, y, yaw) along a walk for progress u in [0, 1], with soft ends."""
     grid = np.linspace(0.0, 1.0, 65)
     ramp = min(0.3, 0.6 / walk.steps)

@@ -1,8 +1,9 @@
 """Columns of each kind of shard; changing them means a new `data.shards.SCHEMA_VERSION`.
 
-Paper: none (engineering). `views`: posed views with truth for the point map and dense pretraining. `clips`: motion with captions
-and replayed views, stage 2. `demos`: expert steps. `rollouts`: SELU's trajectories, one row per episode, stage 3; images, motions
-and cameras have one entry per step and one for the end. `privileged` is for audits only: no loss or prompt may read it.
+Paper: none (engineering). `views`: posed views with truth for the point map and dense pretraining. `clips`: motion with
+captions and replayed views, stage 2. `demos`: expert steps. `rollouts`: SELU's trajectories, one row per episode, stage 3;
+images, motions and cameras have one entry per step and one for the end. `privileged` is for audits only: no loss or prompt
+may read it.
 """
 
 from __future__ import annotations

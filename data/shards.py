@@ -2,8 +2,8 @@
 
 A shard folder holds Arrow files of Hugging Face `datasets` (`part-00000.arrow` …) and `manifest.json` with the schema version,
 the kind, the hash of the producing configuration, and rows and sha256 of each part. Parts are written under a temporary name
-and renamed; the manifest follows each part, so that an interrupted run continues with the parts that are missing. Readers refuse
-unknown versions and name a corrupted file. Files are memory-mapped; nothing is copied into a cache.
+and renamed; the manifest follows each part, so that an interrupted run continues with the parts that are missing. Readers
+refuse unknown versions and name a corrupted file. Files are memory-mapped; nothing is copied into a cache.
 
 Paper: none (engineering). Kinds: `views` (posed views), `clips` (motion with captions and replayed views), `demos` (expert
 steps), `rollouts` (SELU's trajectories, one row per episode).
@@ -250,6 +250,12 @@ class ShardWriter:
         os.replace(temporary, final)
         parts = {**self.manifest.parts, index: Part(final.name, count, digest)}
         self.manifest = Manifest(self.manifest.kind, self.manifest.config_hash, False, parts, self.manifest.metadata)
+        self.manifest.save(self.folder)
+
+    def annotate(self, metadata: Mapping[str, Any]) -> None:
+        """Adds to the manifest's metadata (JSON values) while the folder is not complete yet."""
+        old = self.manifest
+        self.manifest = Manifest(old.kind, old.config_hash, old.complete, old.parts, {**old.metadata, **metadata})
         self.manifest.save(self.folder)
 
     def finish(self, metadata: Mapping[str, Any] | None = None) -> Manifest:
