@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Arm
+from data.records import Action, Arm
 from sim.navigation import NavigationMap, Stance
 from sim.objects import ObjectInstance
 from sim.robots.arm_ik import PerArmSolver
@@ -28,13 +28,14 @@ from sim.robots.build_solver import robot_kit
 from sim.robots.solver import ReachTarget
 from sim.scene import BASE_JOINTS
 from sim.skills.clearance import ClearanceProbe
+from sim.skills.hands import hand_shape
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach_map import HandPose, ReachMap, reach_maps
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.trajectory import plan
 from sim.world import World
 
-__all__ = ["ArmGoal", "Body", "ready_posture", "wait"]
+__all__ = ["ArmGoal", "Body", "BothGoal", "ready_posture", "wait"]
 
 Array = NDArray[np.float64]
 
@@ -63,6 +64,21 @@ class ArmGoal:
     closing_cos: float
 
 
+@dataclass(frozen=True, slots=True)
+class BothGoal:
+    """A solved posture of both arms and the waist.
+
+    Attributes:
+        arms: (A,) joints per arm.
+        waist: waist joints.
+        error_m: largest distance of a grasp site from its wish.
+    """
+
+    arms: Mapping[Arm, Array]
+    waist: Array
+    error_m: float
+
+
 class Body:
     """One robot in a world."""
 
@@ -84,6 +100,7 @@ class Body:
         self._site = {arm: int(model.site(self.spec.arms[arm.value].grasp_site).id) for arm in Arm}
         self._arm_ids = {arm: np.array([self._actuators[name] for name in self.spec.arms[arm.value].joints]) for arm in Arm}
         self._hand_ids = {arm: np.array([self._actuators[name] for name in self.spec.arms[arm.value].hand_joints]) for arm in Arm}
+        self._waist_ids = np.array([self._actuators[name] for name in self.spec.waist_joints])
         self._columns = {arm: kit.model.indices(self.spec.arms[arm.value].joints) for arm in Arm}
         self._vias: dict[Arm, tuple[Array, ...]] = {}
         self.probe = ClearanceProbe(world, self)
@@ -139,9 +156,34 @@ class Body:
         rotation = self.world.data.xmat[thing.body_id].reshape(3, 3)
         return self.world.data.xpos[thing.body_id] + rotation @ (0.5 * (thing.local_min + thing.local_max))
 
+    def subject(self, action: Action) -> str:
+        """Id of the object whose luck decides an action: what is put down, else what the action names."""
+        if action.name == "Place" and action.arm is not None:
+            return self.held[action.arm] or action.object_id or ""
+        if action.name == "PlaceBoth":
+            return self.lifted or action.object_id or ""
+        return action.object_id or ""
+
     def solid_geoms(self, thing: ObjectInstance) -> NDArray[np.int64]:
         """Geoms of an object that take part in contacts."""
         return thing.geom_ids[self.world.model.geom_contype[thing.geom_ids] > 0]
+
+    def part_geoms(self, thing: ObjectInstance, option: str) -> NDArray[np.int64]:
+        """Geoms of an object's parts with a catalogue option, such as `handle` or `toggle`."""
+        return np.array([geom for geom, part in self.world.part_of_geom[thing.object_id] if option in part.options], dtype=np.int64)
+
+    def interaction_point(self, object_id: str) -> Array:
+        """(3,) world point that a robot who goes to an object wants before it: handle, inside, switch or centre."""
+        thing = self.thing(object_id)
+        if thing.moving and not thing.is_open and thing.moving[0].handle_site >= 0:
+            return self.world.data.site_xpos[thing.moving[0].handle_site].copy()
+        if thing.moving:
+            surface = thing.surfaces[0]
+            local = np.array([surface.spec.rect[0], surface.spec.rect[1], surface.spec.z]) - surface.origin
+            return self.world.data.xpos[surface.body_id] + self.world.data.xmat[surface.body_id].reshape(3, 3) @ local
+        if thing.toggle_site >= 0 and not thing.type.pickupable:
+            return self.world.data.site_xpos[thing.toggle_site].copy()
+        return self.world_position(object_id)
 
     def rests(self, thing: ObjectInstance) -> bool:
         """Whether an object touches something that is not part of the robot, from above."""
@@ -154,7 +196,7 @@ class Body:
                 return True
         return False
 
-    def free_spots(self, thing: ObjectInstance, receptacle: ObjectInstance, arm: Arm, count: int = 4) -> list[Array]:
+    def free_spots(self, thing: ObjectInstance, receptacle: ObjectInstance, arm: Arm | None, count: int = 4) -> list[Array]:
         """Free spots (3,) on a receptacle for an object, the ones the arm reaches most easily first."""
         easy = self.easy_point(arm)
         spots: list[Array] = []
@@ -173,12 +215,12 @@ class Body:
                 return spots
         return spots
 
-    def easy_point(self, arm: Arm) -> Array:
-        """World point before the shoulder that the arm reaches most easily."""
+    def easy_point(self, arm: Arm | None) -> Array:
+        """World point before the shoulder that the arm reaches most easily; between the shoulders for both arms."""
         low, high = self.comfortable_distance_m()
-        side = 0.6 if arm is Arm.LEFT else -0.6
+        side = 0.0 if arm is None else 0.6 if arm is Arm.LEFT else -0.6
         base = self.commanded_base()
-        local = np.array([0.5 * (low + high), side * abs(float(self.maps[arm.value].shoulder[1])), 0.0])
+        local = np.array([0.5 * (low + high), side * abs(float(self.maps["left"].shoulder[1])), 0.0])
         return self.turn_to_world(local) + (base.x, base.y, self.pelvis_height_m)
 
     @property
@@ -197,11 +239,19 @@ class Body:
 
     # ---- frames
 
-    def to_pelvis(self, point: Array, pelvis_height_m: float | None = None) -> Array:
-        """A world point in the pelvis frame, for the commanded base and a pelvis height (the commanded one by default)."""
-        base = self.commanded_base()
+    def to_pelvis(self, point: Array, pelvis_height_m: float | None = None, base: Stance | None = None) -> Array:
+        """A world point in the pelvis frame, for a base and a pelvis height (the commanded ones by default)."""
+        base = self.commanded_base() if base is None else base
         height = self.pelvis_height_m if pelvis_height_m is None else pelvis_height_m
         return self.turn_to_pelvis(np.asarray(point, dtype=float) - (base.x, base.y, height))
+
+    def _wish_in_pelvis(self, wish: HandPose, pelvis_height_m: float, base: Stance | None = None) -> HandPose:
+        return HandPose(
+            self.to_pelvis(wish.position, pelvis_height_m, base),
+            None if wish.pointing is None else self.turn_to_pelvis(wish.pointing),
+            None if wish.closing is None else self.turn_to_pelvis(wish.closing),
+            wish.either_way,
+        )
 
     def turn_to_pelvis(self, direction: Array) -> Array:
         """A world direction in the pelvis frame."""
@@ -262,6 +312,7 @@ class Body:
         wish: HandPose,
         start: Array | None = None,
         pelvis_height_m: float | None = None,
+        base: Stance | None = None,
         pointing_weight: float = 0.1,
         roll_weight: float = 0.1,
     ) -> ArmGoal:
@@ -272,17 +323,13 @@ class Body:
             wish: the hand pose, position and directions in the world frame.
             start: (A,) joints to start from; the best postures of the reach map when None.
             pelvis_height_m: pelvis height to solve for, the commanded one by default.
+            base: base pose to solve for, the commanded one by default.
             pointing_weight: weight of the fingers' direction against the position.
             roll_weight: weight of the closing direction.
         """
         height = self.pelvis_height_m if pelvis_height_m is None else pelvis_height_m
         lean = self._lean(height)
-        local = HandPose(
-            self.to_pelvis(wish.position, height),
-            None if wish.pointing is None else self.turn_to_pelvis(wish.pointing),
-            None if wish.closing is None else self.turn_to_pelvis(wish.closing),
-            wish.either_way,
-        )
+        local = self._wish_in_pelvis(wish, height, base)
         reach_map = self.maps[arm.value]
         starts: Sequence[Array]
         if start is None:
@@ -329,6 +376,30 @@ class Body:
         assert best is not None
         return best[1]
 
+    def solve_both(self, wishes: Mapping[Arm, HandPose], start: Mapping[Arm, Array] | None = None) -> BothGoal:
+        """Solves both arms as one problem with the robot's own solver.
+
+        Args:
+            wishes: world hand poses; pointing and closing must be given.
+            start: (A,) joints per arm to start from; the best postures of the reach maps when None.
+        """
+        height = self.pelvis_height_m
+        lean = self._lean(height)
+        q = self.joints()
+        targets: dict[str, ReachTarget] = {}
+        for arm, wish in wishes.items():
+            local = self._wish_in_pelvis(wish, height)
+            if local.pointing is None or local.closing is None:
+                raise ValueError(f"both directions of the {arm} hand must be given, got {wish}")
+            rotation = local.rotation(local.pointing, local.closing)
+            targets[arm.value] = ReachTarget(local.position, rotation, 0.08, 0.05)
+            upright = HandPose(lean.T @ local.position, lean.T @ local.pointing, lean.T @ local.closing)
+            q[self._columns[arm]] = self.maps[arm.value].starts(upright, 1)[0] if start is None else start[arm]
+        result = self.whole_body.solve(targets, q, pelvis_height_m=height, restarts=1, tolerance_m=REACH_TOLERANCE_M)
+        waist = self.kinematics.indices(self.spec.waist_joints)
+        arms = {arm: result.q[self._columns[arm]].copy() for arm in Arm}
+        return BothGoal(arms, result.q[waist].copy(), result.position_error_m)
+
     def heights_in_reach(self, arm: Arm, point: Array) -> list[float]:
         """Pelvis heights, of a grid over the robot's range, at which the arm would reach a world point from this stance."""
         low, high = self.spec.pelvis_height_range_m
@@ -360,6 +431,42 @@ class Body:
             time_s += CONTROL_DT_S
             self.world.data.ctrl[ids] = way.at(time_s)
             yield
+
+    def command_arm(self, arm: Arm, q: Array) -> None:
+        """Sets the arm joints' targets."""
+        self.world.data.ctrl[self._arm_ids[arm]] = q
+
+    def commanded_both(self) -> dict[Arm, Array]:
+        """Commanded joints of both arms."""
+        return {arm: self.commanded_arm(arm) for arm in Arm}
+
+    def commanded_waist(self) -> Array:
+        """Commanded waist joints."""
+        return self.world.data.ctrl[self._waist_ids].copy()
+
+    def move_both(self, goals: Sequence[BothGoal], speed: float = 1.0) -> Skill:
+        """Moves both arms and the waist together through goals, at rest at the end."""
+        ids = np.concatenate([self._arm_ids[Arm.LEFT], self._arm_ids[Arm.RIGHT], self._waist_ids])
+        rows = [np.concatenate([goal.arms[Arm.LEFT], goal.arms[Arm.RIGHT], goal.waist]) for goal in goals]
+        way = plan(np.stack([self.world.data.ctrl[ids].copy(), *rows]), ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed**2)
+        time_s = 0.0
+        while time_s < way.duration_s:
+            time_s += CONTROL_DT_S
+            self.world.data.ctrl[ids] = way.at(time_s)
+            yield
+
+    def high_both(self) -> BothGoal:
+        """Both hands forward at shoulder height, waist straight: the way over what stands before the robot."""
+        return BothGoal({arm: self.vias(arm)[1] for arm in Arm}, np.zeros(len(self._waist_ids)), 0.0)
+
+    def stow_both(self) -> Skill:
+        """Both arms to their ready postures, waist straight."""
+        ready = BothGoal({arm: self.ready(arm) for arm in Arm}, np.zeros(len(self._waist_ids)), 0.0)
+        yield from self.move_both([ready])
+
+    def palm_m(self) -> float:
+        """Distance between the grasp site and the part of the hand that presses on a side."""
+        return hand_shape(self.spec.name).behind_m
 
     def hand_target(self, arm: Arm) -> Array:
         """Commanded hand joints."""

@@ -182,7 +182,7 @@ def go_to(body: Body, action: Action) -> Skill:
         SkillFailure: NoFreePose.
     """
     assert action.object_id is not None
-    target = body.world_position(action.object_id)[:2]
+    target = body.interaction_point(action.object_id)[:2]
     bearing = np.deg2rad(action.bearing_deg) if action.bearing_deg is not None else 0.0
     start = body.commanded_base()
     found = best_stance(

@@ -110,11 +110,10 @@ def pick(body: Body, action: Action, luck: Luck) -> Skill:
     Raises:
         SkillFailure: what `check_pick` and `plan_pick` refuse, GraspMissed, Dropped, or a contingency.
     """
+    grasp, reach = assess_pick(body, action)
     arm = action.arm
     assert arm is not None and action.object_id is not None
     thing = body.thing(action.object_id)
-    check_pick(body, arm, thing)
-    grasp, reach = plan_pick(body, arm, thing)
     name = (thing.object_id,)
     yield from body.move_hand(arm, grasp.opening, 0.2)
     yield from body.move_arm(arm, [*reach.way, reach.before])
@@ -214,11 +213,10 @@ def place(body: Body, action: Action, luck: Luck) -> Skill:
     Raises:
         SkillFailure: what `check_place` and `plan_place` refuse, PlaceMissed, or a contingency.
     """
+    _, reach, retreat = assess_place(body, action)
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    receptacle = body.thing(action.object_id)
-    thing = check_place(body, arm, receptacle)
-    _, reach, retreat = plan_place(body, arm, thing, receptacle)
+    receptacle, thing = body.thing(action.object_id), body.thing(body.held[arm] or "")
     outcome = luck(action)
     name = (thing.object_id,)
     yield from body.move_arm(arm, [*reach.way, reach.before])
@@ -252,6 +250,29 @@ def place(body: Body, action: Action, luck: Luck) -> Skill:
     if receptacle.object_id not in body.world.parents(thing.object_id):
         gap = float(np.linalg.norm(body.world_position(thing.object_id) - body.world_position(receptacle.object_id)))
         raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})
+
+
+def assess_pick(body: Body, action: Action) -> tuple[Grasp, Reach]:
+    """What Pick would do.
+
+    Raises:
+        SkillFailure: as Pick would before it moves.
+    """
+    assert action.arm is not None and action.object_id is not None
+    thing = body.thing(action.object_id)
+    check_pick(body, action.arm, thing)
+    return plan_pick(body, action.arm, thing)
+
+
+def assess_place(body: Body, action: Action) -> tuple[Array, Reach, Array]:
+    """What Place would do.
+
+    Raises:
+        SkillFailure: as Place would before it moves.
+    """
+    assert action.arm is not None and action.object_id is not None
+    receptacle = body.thing(action.object_id)
+    return plan_place(body, action.arm, check_place(body, action.arm, receptacle), receptacle)
 
 
 def reset_arm(body: Body, action: Action, luck: Luck) -> Skill:

@@ -1,0 +1,261 @@
+"""Open, Close, ToggleOn, ToggleOff: hands on handles and switches.
+
+The hand goes to the handle until it touches it, then leads it along the door's arc or the drawer's slide; a ball joint at the
+grasp stands for the fingers around the bar. Where the arm cannot follow all the way, the robot steps back with it. What counts is
+the joint's position afterwards. A switch flips when a finger touches it.
+
+Paper: Open and Toggle of the DualTHOR action space; Close is ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Action, Arm
+from sim.failures import FailureCode, SkillFailure
+from sim.navigation import Stance
+from sim.objects import MovingPart, ObjectInstance
+from sim.skills.body import Body, wait
+from sim.skills.checks import check_open_close, check_toggle
+from sim.skills.grasps import hand_shape
+from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
+from sim.skills.reach import Reach, out_of_reach, plan_reach
+from sim.skills.reach_map import HandPose
+from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.trajectory import min_jerk
+
+__all__ = ["assess_open_close", "assess_toggle", "open_close", "toggle"]
+
+Array = NDArray[np.float64]
+_UP: Final = np.array([0.0, 0.0, 1.0])
+_SPEED: Final = 0.45
+#: Share of the joint's range that Open leads the door to, and least share that counts as done.
+_OPEN_TO: Final = 0.95
+_OPEN_MIN: Final = 0.45
+_CLOSED_MAX: Final = 0.06
+_WAYPOINTS: Final = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Pull:
+    """How the hand leads a handle.
+
+    Attributes:
+        reach: the motion to the handle.
+        part: the door or drawer.
+        positions: (N,) joint positions along the way.
+        postures: (N, A) arm joints that go with them.
+        back_m: how far the base steps back on the way.
+    """
+
+    reach: Reach
+    part: MovingPart
+    positions: Array
+    postures: Array
+    back_m: float
+
+
+def handle_at(body: Body, part: MovingPart, position: float) -> Array:
+    """(3,) world position of a handle at a joint position."""
+    model, data = body.world.model, body.world.data
+    now = data.site_xpos[part.handle_site]
+    axis, change = data.xaxis[part.joint_id], position - float(data.qpos[part.qpos_adr])
+    if int(model.jnt_type[part.joint_id]) == 2:  # slide
+        return now + change * axis
+    arm = now - data.xanchor[part.joint_id]
+    c, s = np.cos(change), np.sin(change)
+    turned = c * arm + s * np.cross(axis, arm) + (1.0 - c) * float(axis @ arm) * axis
+    return data.xanchor[part.joint_id] + turned
+
+
+def _pointings(body: Body, arm: Arm, point: Array) -> Iterator[Array]:
+    sight = point - body.shoulder(arm)
+    azimuth = float(np.arctan2(sight[1], sight[0]))
+    for elevation in (-10.0, -35.0, 15.0, -60.0):
+        for offset in (0.0, 30.0, -30.0, 60.0, -60.0):
+            a, e = azimuth + np.deg2rad(offset), np.deg2rad(elevation)
+            yield np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+
+
+def assess_open_close(body: Body, action: Action) -> Pull:
+    """What Open or Close would do.
+
+    Raises:
+        SkillFailure: as the skill would before it moves.
+    """
+    assert action.arm is not None and action.object_id is not None
+    arm, thing, opening = action.arm, body.thing(action.object_id), action.name == "Open"
+    check_open_close(body, arm, thing, opening)
+    part = thing.moving[0]
+    handle = body.world.data.site_xpos[part.handle_site].copy()
+    low, high = part.range
+    goal = low + _OPEN_TO * (high - low) if opening else low
+    tried = 0
+    for pointing in _pointings(body, arm, handle):
+        for closing in (None,):
+            wish = HandPose(handle - 0.02 * pointing, pointing, closing)
+            reach = plan_reach(body, arm, wish, -pointing, 0.09, (thing.object_id,), pointing=0.6)
+            if reach is None:
+                continue
+            tried += 1
+            pull = _plan_pull(body, arm, part, reach, wish.position - handle, goal, opening)
+            if pull is not None:
+                return pull
+            if tried > 6:
+                break
+    failure = out_of_reach(body, arm, handle)
+    if failure is not None:
+        raise failure
+    raise SkillFailure(FailureCode.OBSTRUCTED, {"gap_m": 0.0})
+
+
+def _plan_pull(
+    body: Body, arm: Arm, part: MovingPart, reach: Reach, offset: Array, goal: float, opening: bool
+) -> Pull | None:
+    start = float(body.world.data.qpos[part.qpos_adr])
+    positions = np.linspace(start, goal, _WAYPOINTS)
+    base = body.commanded_base()
+    ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
+    free_m = body.navigation().free_travel(base.position, base.position - 0.5 * ahead)
+    span = abs(part.range[1] - part.range[0])
+    best: Pull | None = None
+    for back in (0.0, 0.12, 0.24, 0.36, 0.48):
+        if back > free_m:
+            break
+        postures = [reach.at]
+        for share, position in zip(np.linspace(0.0, 1.0, _WAYPOINTS)[1:], positions[1:], strict=True):
+            x, y = base.position - back * share * ahead
+            target = HandPose(handle_at(body, part, float(position)) + offset)
+            solved = body.solve(arm, target, start=postures[-1], base=Stance(float(x), float(y), base.yaw_rad))
+            if solved.error_m > 0.02 or float(np.max(np.abs(solved.q - postures[-1]))) > 0.9:
+                break
+            postures.append(solved.q)
+        count = len(postures)
+        share = back * (count - 1) / (_WAYPOINTS - 1)
+        pull = Pull(reach, part, positions[:count], np.stack(postures), share)
+        if best is None or count > len(best.positions):
+            best = pull
+        if count == _WAYPOINTS:
+            break
+    if best is None or len(best.positions) < 2:
+        return None
+    reached = (float(best.positions[-1]) - part.range[0]) / span
+    done = reached > _OPEN_MIN + 0.05 if opening else reached < 0.02
+    return best if done else None
+
+
+def open_close(body: Body, action: Action, luck: Luck) -> Skill:
+    """Open and Close: leads a door or drawer by its handle.
+
+    Raises:
+        SkillFailure: what `assess_open_close` refuses, GraspMissed, HandleSlipped, or a contingency.
+    """
+    pull = assess_open_close(body, action)
+    arm = action.arm
+    assert arm is not None and action.object_id is not None
+    thing, opening, part = body.thing(action.object_id), action.name == "Open", pull.part
+    name = (thing.object_id,)
+    yield from body.move_hand(arm, 1.0, 0.2)
+    yield from body.move_arm(arm, [*pull.reach.way, pull.reach.before])
+    yield from body.move_arm(arm, [pull.reach.at], speed=0.8)
+    yield from body.move_hand(arm, 0.35, 0.3)
+    handle = body.part_geoms(thing, "handle")
+    gap = body.probe.hand_gap_m(arm, handle)
+    if gap > GRASP_GAP_M:
+        yield from _leave(body, arm, pull.reach, name)
+        raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": gap})
+    outcome = luck(action)
+    if outcome != "success":
+        yield from wait(0.2)
+        yield from _leave(body, arm, pull.reach, name)
+        code = FailureCode.LOCKED if outcome == "locked" else FailureCode.NOTHING_HAPPENED
+        raise SkillFailure(code, contingency=outcome)
+    body.world.attach(arm.value, thing.object_id)
+    yield from _lead(body, arm, pull)
+    body.world.detach(arm.value)
+    yield from body.move_hand(arm, 1.0, 0.2)
+    position, hand = body.hand_pose(arm)
+    away = body.solve(arm, HandPose(position - 0.08 * hand[:, 0], hand[:, 0]), start=body.commanded_arm(arm))
+    if away.error_m < 0.03:
+        yield from body.move_arm(arm, [away.q])
+    yield from stow(body, arm, name)
+    share = (float(body.world.data.qpos[part.qpos_adr]) - part.range[0]) / (part.range[1] - part.range[0])
+    if (opening and share < _OPEN_MIN) or (not opening and share > _CLOSED_MAX):
+        raise SkillFailure(FailureCode.HANDLE_SLIPPED, {"gap_m": share})
+
+
+def _lead(body: Body, arm: Arm, pull: Pull) -> Skill:
+    """Moves hand and, where planned, base along the planned way."""
+    base = body.commanded_base()
+    ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
+    hinge = abs(float(pull.positions[-1] - pull.positions[0]))
+    length = hinge * 0.5 if pull.part.range[1] > 0.6 else hinge
+    duration = 1.875 * max(length, 0.1) / _SPEED
+    shares = np.linspace(0.0, 1.0, len(pull.positions))
+    steps = max(2, round(duration / CONTROL_DT_S))
+    for k in range(1, steps + 1):
+        s = min_jerk(k / steps)
+        body.command_arm(arm, np.array([np.interp(s, shares, column) for column in pull.postures.T]))
+        if pull.back_m > 0.0:
+            x, y = base.position - s * pull.back_m * ahead
+            body.command_base(float(x), float(y), base.yaw_rad)
+        yield
+    yield from wait(0.1)
+
+
+def _leave(body: Body, arm: Arm, reach: Reach, ignore: tuple[str, ...]) -> Skill:
+    yield from body.move_hand(arm, 1.0, 0.2)
+    yield from body.move_arm(arm, [reach.before])
+    yield from stow(body, arm, ignore)
+
+
+def assess_toggle(body: Body, action: Action) -> Reach:
+    """What ToggleOn or ToggleOff would do.
+
+    Raises:
+        SkillFailure: as the skill would before it moves.
+    """
+    assert action.arm is not None and action.object_id is not None
+    arm, thing = action.arm, body.thing(action.object_id)
+    check_toggle(body, arm, thing, action.name == "ToggleOn")
+    switch = body.world.toggle_point(thing.object_id)
+    tip = hand_shape(body.spec.name).tip_m
+    for pointing in _pointings(body, arm, switch):
+        wish = HandPose(switch - (tip - 0.006) * pointing, pointing)
+        reach = plan_reach(body, arm, wish, -pointing, 0.07, (thing.object_id,), pointing=0.85)
+        if reach is not None:
+            return reach
+    failure = out_of_reach(body, arm, switch)
+    if failure is not None:
+        raise failure
+    raise SkillFailure(FailureCode.OBSTRUCTED, {"gap_m": 0.0})
+
+
+def toggle(body: Body, action: Action, luck: Luck) -> Skill:
+    """ToggleOn and ToggleOff: presses a switch or knob with the fingers.
+
+    Raises:
+        SkillFailure: what `assess_toggle` refuses, GraspMissed when no finger comes to the switch, or a contingency.
+    """
+    reach = assess_toggle(body, action)
+    arm = action.arm
+    assert arm is not None and action.object_id is not None
+    thing = body.thing(action.object_id)
+    yield from body.move_arm(arm, [*reach.way, reach.before])
+    yield from body.move_arm(arm, [reach.at], speed=0.7)
+    yield from wait(0.1)
+    gap = body.probe.hand_gap_m(arm, body.part_geoms(thing, "toggle"))
+    outcome = luck(action)
+    if gap <= GRASP_GAP_M and outcome == "success":
+        body.world.set_state(thing.object_id, "isToggled", action.name == "ToggleOn")
+    yield from body.move_arm(arm, [reach.before])
+    yield from stow(body, arm)
+    if gap > GRASP_GAP_M:
+        raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": gap})
+    if outcome != "success":
+        raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)

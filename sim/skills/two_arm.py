@@ -1,0 +1,245 @@
+"""Lift and PlaceBoth: both hands press on opposite sides of an object, raise it and put it down together.
+
+Both arms (and the waist, where the robot's solver owns it) are one inverse-kinematics problem here. The lift holds only when
+both hands touch the object. Paper: dual-arm essential tasks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Action, Arm
+from sim.failures import FailureCode, SkillFailure
+from sim.objects import ObjectInstance
+from sim.skills.body import Body, BothGoal, wait
+from sim.skills.checks import check_lift, check_place_both
+from sim.skills.grasps import solid_box
+from sim.skills.manipulate import GRASP_GAP_M, Luck
+from sim.skills.reach import out_of_reach
+from sim.skills.reach_map import HandPose
+from sim.skills.runner import CONTROL_DT_S, Skill
+
+__all__ = ["assess_lift", "assess_place_both", "lift", "place_both"]
+
+Array = NDArray[np.float64]
+_UP: Final = np.array([0.0, 0.0, 1.0])
+_APART_M: Final = 0.09
+_TOLERANCE_M: Final = 0.02
+#: Ways to hold what was lifted: metres up and towards the body, the best first.
+_HOLDS: Final = ((0.25, 0.1), (0.2, 0.06), (0.15, 0.05), (0.12, 0.0), (0.3, 0.0), (0.08, 0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class BothReach:
+    """A motion of both hands: around the object, before it, and pressing on it."""
+
+    before: BothGoal
+    at: BothGoal
+
+
+def _sides(body: Body, thing: ObjectInstance) -> dict[Arm, tuple[Array, Array]]:
+    """Per arm the point that its palm presses on and the outward normal there, world frame."""
+    pose = body.world.pose(thing.object_id)
+    rotation = pose[:3, :3]
+    low, high = solid_box(thing)
+    center = pose[:3, 3] + rotation @ (0.5 * (low + high))
+    half = 0.5 * (high - low)
+    left = body.turn_to_world(np.array([0.0, 1.0, 0.0]))
+    axis = int(np.argmax([abs(float(rotation[:, 0] @ left)), abs(float(rotation[:, 1] @ left))]))
+    lateral = rotation[:, axis] * np.sign(rotation[:, axis] @ left)
+    points: dict[Arm, tuple[Array, Array]] = {}
+    grips = body.world.grips(thing.object_id, "double") if thing.type.grips.get("double") and axis == 0 else None
+    for arm, sign in ((Arm.LEFT, 1.0), (Arm.RIGHT, -1.0)):
+        normal = sign * lateral
+        point = center + normal * half[axis]
+        if grips is not None:
+            point = max(grips, key=lambda grip: float(grip @ normal))
+        else:
+            point = point + _UP * min(0.15 * half[2], 0.05)
+        points[arm] = (point, normal)
+    return points
+
+
+def _goal(body: Body, sides: Mapping[Arm, tuple[Array, Array]], apart_m: float, start: Mapping[Arm, Array] | None) -> BothGoal:
+    """Both hands beside the object, `apart_m` from its surfaces, fingers ahead and palms inward."""
+    ahead = body.turn_to_world(np.array([0.94, 0.0, -0.34]))
+    wishes = {}
+    for arm, (point, normal) in sides.items():
+        inward = -normal
+        wishes[arm] = HandPose(point + (apart_m - body.palm_m()) * normal, ahead, inward)
+    return body.solve_both(wishes, start)
+
+
+def assess_lift(body: Body, action: Action) -> BothReach:
+    """What Lift would do.
+
+    Raises:
+        SkillFailure: as Lift would before it moves.
+    """
+    assert action.object_id is not None
+    thing = body.thing(action.object_id)
+    check_lift(body, thing)
+    sides = _sides(body, thing)
+    before = _goal(body, sides, _APART_M, None)
+    at = _goal(body, sides, 0.004, before.arms)
+    if before.error_m > _TOLERANCE_M or at.error_m > _TOLERANCE_M:
+        raise _unreachable(body, {arm: point for arm, (point, _) in sides.items()})
+    return BothReach(before, at)
+
+
+def _unreachable(body: Body, points: Mapping[Arm, Array]) -> SkillFailure:
+    """Why both hands cannot reach their points at once: the first arm that has a reason, else a common height."""
+    for arm, point in points.items():
+        failure = out_of_reach(body, arm, point)
+        if failure is not None:
+            return failure
+    common = set.intersection(*(set(np.round(body.heights_in_reach(arm, p), 3)) for arm, p in points.items()))
+    if common:
+        middle = float(np.median(sorted(common)))
+        change = middle - body.pelvis_height_m
+        if abs(change) > 0.06:
+            code = FailureCode.BODY_TOO_HIGH if change < 0 else FailureCode.BODY_TOO_LOW
+            return SkillFailure(code, {"height_m": change})
+    return SkillFailure(FailureCode.TOO_FAR, {"reach_m": 0.0})
+
+
+def lift(body: Body, action: Action, luck: Luck) -> Skill:
+    """Lift: takes an object between both hands and raises it.
+
+    Raises:
+        SkillFailure: what `assess_lift` refuses, GraspMissed, Dropped, or a contingency.
+    """
+    reach = assess_lift(body, action)
+    assert action.object_id is not None
+    thing = body.thing(action.object_id)
+    for arm in Arm:
+        body.command_hand(arm, 1.0)
+    yield from body.move_both([body.high_both(), reach.before])
+    yield from _press(body, reach, thing)
+    gaps = {arm: body.probe.hand_gap_m(arm, body.solid_geoms(thing)) for arm in Arm}
+    if max(gaps.values()) > GRASP_GAP_M:
+        yield from body.move_both([reach.before])
+        yield from body.stow_both()
+        raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": max(gaps.values())})
+    outcome = luck(action)
+    for arm in Arm:
+        body.world.attach(arm.value, thing.object_id)
+    first = _shifted(body, 0.05, 0.0)
+    yield from body.move_both([first], speed=0.5)
+    if outcome != "success":
+        for arm in Arm:
+            body.world.detach(arm.value)
+        if outcome == "spilled" and thing.type.fillable:
+            body.world.set_state(thing.object_id, "isFilledWithLiquid", False)
+        yield from body.move_both([reach.before])
+        yield from body.stow_both()
+        code = FailureCode.SPILLED if outcome == "spilled" else FailureCode.SLIPPED
+        raise SkillFailure(code, contingency=outcome)
+    for up, back in _HOLDS:
+        goal = _shifted(body, up, back)
+        if goal.error_m <= _TOLERANCE_M:
+            yield from body.move_both([goal], speed=0.5)
+            break
+    yield from wait(0.1)
+    if body.lifted != thing.object_id or thing.object_id in body.world.all_parents():
+        raise SkillFailure(FailureCode.DROPPED)
+
+
+def _press(body: Body, reach: BothReach, thing: ObjectInstance) -> Skill:
+    """Moves both hands inwards; each one stops when it touches."""
+    geoms = body.solid_geoms(thing)
+    start = body.commanded_both()
+    steps = round(0.5 / CONTROL_DT_S)
+    share = dict.fromkeys(Arm, 0.0)
+    for k in range(1, round(1.3 * steps) + 1):
+        for arm in Arm:
+            if k % 2 == 0 and body.probe.hand_gap_m(arm, geoms) < 0.001:
+                continue
+            share[arm] = min(k / steps, 1.3)
+            body.command_arm(arm, start[arm] + share[arm] * (reach.at.arms[arm] - start[arm]))
+        yield
+
+
+def _shifted(body: Body, up_m: float, back_m: float) -> BothGoal:
+    """Both hands moved by the same displacement, their orientation kept."""
+    move = up_m * _UP - back_m * body.turn_to_world(np.array([1.0, 0.0, 0.0]))
+    wishes = {}
+    for arm in Arm:
+        position, hand = body.hand_pose(arm)
+        wishes[arm] = HandPose(position + move, hand[:, 0], hand[:, 1])
+    return body.solve_both(wishes, body.commanded_both())
+
+
+def assess_place_both(body: Body, action: Action) -> tuple[BothGoal, BothGoal]:
+    """What PlaceBoth would do: hands above the spot, and at it.
+
+    Raises:
+        SkillFailure: as PlaceBoth would before it moves.
+    """
+    assert action.object_id is not None
+    receptacle = body.thing(action.object_id)
+    thing = check_place_both(body, receptacle)
+    spots = body.free_spots(thing, receptacle, None)
+    if not spots:
+        raise SkillFailure(FailureCode.RECEPTACLE_FULL)
+    points: dict[Arm, Array] = {}
+    for spot in spots:
+        low, _ = body.world.bounds(thing.object_id)
+        origin = body.world.pose(thing.object_id)[:3, 3]
+        move = spot - origin + (0.0, 0.0, origin[2] - low[2] + 0.004)
+        wishes, above = {}, {}
+        for arm in Arm:
+            position, hand = body.hand_pose(arm)
+            wishes[arm] = HandPose(position + move, hand[:, 0], hand[:, 1])
+            above[arm] = HandPose(position + move + 0.07 * _UP, hand[:, 0], hand[:, 1])
+        if not points:
+            points = {arm: wish.position for arm, wish in wishes.items()}
+        at = body.solve_both(wishes, body.commanded_both())
+        before = body.solve_both(above, at.arms)
+        if at.error_m <= _TOLERANCE_M and before.error_m <= 1.5 * _TOLERANCE_M:
+            return before, at
+    raise _unreachable(body, points)
+
+
+def place_both(body: Body, action: Action, luck: Luck) -> Skill:
+    """PlaceBoth: puts down what both hands hold.
+
+    Raises:
+        SkillFailure: what `assess_place_both` refuses, PlaceMissed, or a contingency.
+    """
+    before, at = assess_place_both(body, action)
+    assert action.object_id is not None
+    thing, receptacle = body.thing(body.lifted or ""), body.thing(action.object_id)
+    hold = body.commanded_both()
+    yield from body.move_both([before], speed=0.6)
+    outcome = luck(action)
+    if outcome != "success":
+        yield from body.move_both([BothGoal(hold, body.commanded_waist(), 0.0)], speed=0.6)
+        raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
+    for _ in body.move_both([at], speed=0.4):
+        yield
+        if body.rests(thing):
+            break
+    yield from wait(0.1)
+    for arm in Arm:
+        body.world.detach(arm.value)
+    wishes = {}
+    outward = body.turn_to_world(np.array([0.0, 1.0, 0.0]))
+    for arm, sign in ((Arm.LEFT, 1.0), (Arm.RIGHT, -1.0)):
+        position, hand = body.hand_pose(arm)
+        wishes[arm] = HandPose(position + sign * 0.09 * outward + 0.01 * _UP, hand[:, 0], hand[:, 1])
+    apart = body.solve_both(wishes, body.commanded_both())
+    yield from body.move_both([apart], speed=0.6)
+    yield from body.stow_both()
+    for _ in range(int(0.6 / CONTROL_DT_S)):
+        if body.world.speed_of(thing.object_id) < 0.02:
+            break
+        yield
+    if receptacle.object_id not in body.world.parents(thing.object_id):
+        gap = float(np.linalg.norm(body.world_position(thing.object_id) - body.world_position(receptacle.object_id)))
+        raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})
