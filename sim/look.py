@@ -37,7 +37,6 @@ def room_pictures(folder: Path, robot: str = "h1") -> list[Path]:
             path = folder / f"{room}_{camera}_{width}.png"
             iio.imwrite(path, world.render(camera, height, width).rgb)
             written.append(path)
-        world.close()
     return written
 
 

@@ -9,14 +9,14 @@ Camera frame: x right, y down, z forward. Shape letters: H rows, W columns.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.canvas import shared_canvas
 from sim.gl import RenderingError
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 __all__ = ["CAMERAS", "Renderer", "RenderingError", "View", "camera_intrinsics", "camera_pose"]
 
 CAMERAS: Final = ("head", "front", "left", "right", "behind", "top", "overview", "plan")
+MAX_SIZE: Final = 1280
+_MAX_GEOMS: Final = 1500
 _ROBOT: Final = -2
 _NOTHING: Final = -1
 
@@ -74,7 +76,7 @@ def _camera_id(world: World, camera: str) -> int:
 
 
 class Renderer:
-    """Draws a world at one size; keeps its OpenGL context until `close`.
+    """Draws a world at one size.
 
     Args:
         world: what is drawn; it may advance between calls.
@@ -88,19 +90,22 @@ class Renderer:
     """
 
     def __init__(self, world: World, height: int = 112, width: int = 112, *, pretty: bool = False) -> None:
-        if not (1 <= height <= 1280 and 1 <= width <= 1280):
-            raise ValueError(f"image size {height} x {width} outside 1..1280")
+        if not (1 <= height <= MAX_SIZE and 1 <= width <= MAX_SIZE):
+            raise ValueError(f"image size {height} x {width} outside 1..{MAX_SIZE}")
         self._world, self._height, self._width = world, height, width
-        self._renderer = _make_renderer(world.model, height, width)
+        self._canvas = shared_canvas(world.model, world.model_name, height, width)
+        self._scene = mujoco.MjvScene(world.model, maxgeom=_MAX_GEOMS)
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = 0
         self._option.geomgroup[[0, 1, 2]] = 1
         self._option.sitegroup[:] = 0
-        scene: Any = self._renderer.scene
-        for flag in ("mjRND_SHADOW", "mjRND_REFLECTION"):
-            scene.flags[int(getattr(mujoco.mjtRndFlag, flag))] = int(pretty)
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = int(mujoco.mjtCamera.mjCAMERA_FIXED)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._scene.flags[int(flag)] = int(pretty)
         robot = np.isin(world.model.geom_bodyid, list(world.robot_body_ids))
-        self._labels = np.where(robot, _ROBOT, world.object_of_geom).astype(np.int32)
+        labels = np.where(robot, _ROBOT, world.object_of_geom).astype(np.int32)
+        self._labels = np.append(labels, _NOTHING)  # the last entry is what geom -1, the sky, maps to
 
     def view(self, camera: str = "head", *, depth: bool = False, segmentation: bool = False) -> View:
         """Draws one camera as the world is now.
@@ -108,40 +113,20 @@ class Renderer:
         Raises:
             ValueError: on an unknown camera.
         """
-        world, renderer = self._world, self._renderer
+        world = self._world
+        self._camera.fixedcamid = _camera_id(world, camera)
         mujoco.mj_camlight(world.model, world.data)
-        renderer.update_scene(world.data, camera=_camera_id(world, camera), scene_option=self._option)
-        rgb = renderer.render().copy()
+        everything = int(mujoco.mjtCatBit.mjCAT_ALL)
+        mujoco.mjv_updateScene(world.model, world.data, self._option, None, self._camera, everything, self._scene)
         distances = labels = None
-        if depth:
-            renderer.enable_depth_rendering()
-            distances = renderer.render().copy()
-            renderer.disable_depth_rendering()
-        if segmentation:
-            renderer.enable_segmentation_rendering()
-            pairs = renderer.render()  # (H, W, 2): object id, object type
-            renderer.disable_segmentation_rendering()
-            is_geom = pairs[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)
-            labels = np.where(is_geom, self._labels[np.where(is_geom, pairs[..., 0], 0)], _NOTHING).astype(np.int32)
+        if depth or segmentation:
+            metres, geoms = self._canvas.depth_and_geoms(world.model, self._scene)
+            distances = metres if depth else None
+            labels = self._labels[geoms] if segmentation else None
         return View(
-            rgb,
+            self._canvas.colors(self._scene),
             distances,
             labels,
             camera_intrinsics(world, camera, self._height, self._width),
             camera_pose(world, camera),
         )
-
-    def close(self) -> None:
-        """Frees the OpenGL context."""
-        self._renderer.close()
-
-
-def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
-    try:
-        return mujoco.Renderer(model, height, width)
-    except (ImportError, RuntimeError, AttributeError, mujoco.FatalError) as error:
-        raise RenderingError(
-            f"no OpenGL context with MUJOCO_GL={os.environ.get('MUJOCO_GL')}: {error}. Install libegl1 (MUJOCO_GL=egl) or "
-            "libosmesa6 (MUJOCO_GL=osmesa), for example: apt-get install libegl1 libgl1-mesa-dri libosmesa6. A program that "
-            "imports mujoco before sim must set MUJOCO_GL itself."
-        ) from error

@@ -638,7 +638,7 @@ class World:
     def render(
         self, camera: str = "head", height: int = 112, width: int = 112, *, depth: bool = False, segmentation: bool = False
     ) -> View:
-        """Draws a camera of `sim.rendering.CAMERAS`; contexts are kept per size until `close`."""
+        """Draws a camera of `sim.rendering.CAMERAS`; OpenGL contexts are shared by equal scenes."""
         renderer = self._renderers.get((height, width))
         if renderer is None:
             renderer = self._renderers[height, width] = Renderer(self, height, width)
@@ -663,10 +663,13 @@ class World:
         found = {names[int(label)]: int(count) for label, count in zip(labels, counts, strict=True) if count >= least}
         return {name: count for name, count in found.items() if self.distance_to(name) <= range_m}
 
+    @property
+    def model_name(self) -> str:
+        """Names the robot's file and the room: scenes of equal name have equal meshes and textures."""
+        return f"{self._key.mjcf_path}|{self.room.name}"
+
     def close(self) -> None:
-        """Frees OpenGL contexts; the world stays usable."""
-        for renderer in self._renderers.values():
-            renderer.close()
+        """Drops the world's renderers; the shared OpenGL contexts stay with the process, and the world stays usable."""
         self._renderers.clear()
 
     # ---- snapshots ----------------------------------------------------------------------------------------------------------

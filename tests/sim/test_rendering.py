@@ -6,9 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from sim.canvas import Canvas
 from sim.gl import RenderingError, select_backend
 from sim.objects import ObjectPlacement
-from sim.rendering import CAMERAS, Renderer
+from sim.rendering import CAMERAS
 from sim.robots.spec import load_robot
 from sim.world import World
 
@@ -64,13 +65,26 @@ def test_visible_objects(world: World) -> None:
     assert "CounterTop_1" not in world.visible_objects(range_m=0.3)
 
 
+def test_agrees_with_mujocos_own_renderer(world: World) -> None:
+    view = world.render("left", 80, 100, depth=True, segmentation=True)
+    option = mujoco.MjvOption()
+    option.sitegroup[:] = 0
+    option.geomgroup[3:] = 0
+    with mujoco.Renderer(world.model, 80, 100) as renderer:
+        renderer.scene.flags[int(mujoco.mjtRndFlag.mjRND_SHADOW)] = 0
+        renderer.scene.flags[int(mujoco.mjtRndFlag.mjRND_REFLECTION)] = 0
+        renderer.update_scene(world.data, camera="left", scene_option=option)
+        assert np.array_equal(renderer.render(), view.rgb)
+        renderer.enable_depth_rendering()
+        assert view.depth == pytest.approx(renderer.render(), rel=1e-4)
+
+
 def test_lamps_light_up() -> None:
     room = World(None, "living_room_1", [])
     before = room.render("overview", 224, 224).rgb.astype(int)
     room.set_state("Television_1", "isToggled", True)
     after = room.render("overview", 224, 224).rgb.astype(int)
     assert np.abs(after - before).max() > 80
-    room.close()
 
 
 def test_two_sizes_and_repeated_pictures_are_equal(world: World) -> None:
@@ -86,9 +100,9 @@ def test_bad_requests_are_refused(world: World, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv("MUJOCO_GL", "vulkan")
     with pytest.raises(RenderingError, match="vulkan"):
         select_backend()
-    monkeypatch.setattr(mujoco, "Renderer", _broken)
+    monkeypatch.setattr(mujoco, "GLContext", _broken)
     with pytest.raises(RenderingError, match="libegl1"):
-        Renderer(world)
+        Canvas(world.model, 20, 20)
 
 
 def _broken(*_: object) -> None:
