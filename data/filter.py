@@ -101,7 +101,8 @@ def gate(metrics: Metrics, pelvis_height_m: NDArray[np.float64], standing_m: flo
         value, limit = getattr(metrics, name), getattr(limits, name)
         if not value <= limit:
             return f"{name} {value:.2f} over {limit:g}"
-    low = max((end - start for start, end in contact_runs(np.asarray(pelvis_height_m < limits.low_pelvis * standing_m))),
-    default=0) if low > limits.low_pelvis_s * fps:
+    is_low = np.asarray(pelvis_height_m < limits.low_pelvis * standing_m, dtype=np.bool_)
+    low = max((end - start for start, end in contact_runs(is_low)), default=0)
+    if low > limits.low_pelvis_s * fps:
         return f"pelvis below {limits.low_pelvis:g} of standing for {low / fps:.1f} s"
     return ""

@@ -113,8 +113,17 @@ def saturation_pct(q: Array, lower: Array, upper: Array, margin: float = 0.01) -
 
 
 def balance_cm(retargeter: Retargeter, result: Retargeted, soles: Array) -> float:
-    """Mean signed distance (cm) of the centre of mass to the support polygon's edge, over slow frames with both feet
-    planted.""" motion = result.motion
+    """Mean signed distance (cm) of the centre of mass to the support polygon's edge, over slow double support.
+
+    Args:
+        retargeter: of the robot.
+        result: retargeted clip.
+        soles: (T, 2, 3) metres.
+
+    Returns:
+        Positive inside; nan without such frames.
+    """
+    motion = result.motion
     assert motion.root_pose is not None
     assert motion.joint_positions is not None
     slow = np.zeros(len(soles), dtype=bool)

@@ -66,8 +66,9 @@ class Pictures:
     seed: int
 
 
-#: Motion, configuration and seed to pictures; None when no room has a free path. A module-level function, so that processes
-find it. Replay = Callable[[Motion, ReplayConfig, int], Pictures | None]
+#: Motion, configuration and seed to pictures; None when no room has a free path. A module-level function, so that worker
+#: processes find it.
+Replay = Callable[[Motion, ReplayConfig, int], Pictures | None]
 
 
 @dataclass(frozen=True, slots=True)

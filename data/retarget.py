@@ -339,8 +339,8 @@ class Retargeter:
 
 
 def _bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) -> Array:
-    """Newton step whose joint part (all but the first six entries) stays within bounds; joints that would leave are held at
-    them.""" step = -np.linalg.solve(hessian, gradient)
+    """Newton step whose joint part (all but the first six entries) stays within bounds; joints that would leave are held."""
+    step = -np.linalg.solve(hessian, gradient)
     held = np.zeros(len(step), dtype=bool)
     for _ in range(3):
         joints = step[6:]
@@ -357,7 +357,8 @@ def _bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) -
 
 
 def _length(vectors: Array) -> Array:
-    return np.sqrt(np.sum(vectors * vectors, axis=-1))
+    lengths: Array = np.linalg.norm(vectors, axis=-1).astype(np.float64)
+    return lengths
 
 
 def _unit(vectors: Array) -> Array:
@@ -375,8 +376,8 @@ def _about_z(yaw_rad: Array) -> Array:
 
 
 def _level(rotation: Array) -> Array:
-    """The rotation closest to `rotation` that is reached by a right-angled frame change with the foot flat and pointing along
-    x.""" snapped = np.zeros((3, 3))
+    """The right-angled rotation closest to `rotation`: the sole's frame when the foot is flat and points along x."""
+    snapped = np.zeros((3, 3))
     for column in range(3):
         row = int(np.argmax(np.abs(rotation[:, column])))
         snapped[row, column] = np.sign(rotation[row, column])
