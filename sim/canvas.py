@@ -39,7 +39,8 @@ class Canvas:
             self._context = mujoco.MjrContext(model, int(mujoco.mjtFontScale.mjFONTSCALE_50))
         except (ImportError, RuntimeError, AttributeError, TypeError, mujoco.FatalError) as error:
             raise RenderingError(
-                f"no OpenGL context with MUJOCO_GL={os.environ.get('MUJOCO_GL')}: {error}. Install libegl1 (MUJOCO_GL=egl) "
+                f"no OpenGL context with MUJOCO_GL={os.environ.get('MUJOCO_GL')}: {error}. "
+                "Install libegl1 (MUJOCO_GL=egl) "
                 "or libosmesa6 (MUJOCO_GL=osmesa), for example: apt-get install libegl1 libgl1-mesa-dri libosmesa6. A program that "
                 "imports mujoco before sim must set MUJOCO_GL itself."
             ) from error
