@@ -67,6 +67,7 @@ class BaseConfig:
         joint: loop of the mixed batches.
         questions: question and answer pairs packed per image.
         plan_share: share of the joint batches that are planning demonstrations.
+        judge_share: share of judging questions among the planning demonstrations.
         dense_weight: weight of the dense loss on the joint batches' views.
     """
 
@@ -74,10 +75,12 @@ class BaseConfig:
     joint: LoopConfig
     questions: int = 8
     plan_share: float = 0.6
+    judge_share: float = 0.15
     dense_weight: float = 0.5
 
     def __post_init__(self) -> None:
-        _require(0.0 <= self.plan_share <= 1.0, f"plan_share {self.plan_share} outside [0, 1]")
+        for name in ("plan_share", "judge_share"):
+            _require(0.0 <= getattr(self, name) <= 1.0, f"{name} {getattr(self, name)} outside [0, 1]")
         _require(self.questions > 0, f"questions {self.questions} must be positive")
 
 
@@ -90,6 +93,7 @@ class AlignmentConfig:
         image: loop of phase 2a-ii, motion and image; the language model's LoRA frozen.
         joint: loop of phase 2b; rows, LoRA, CSE and merger train.
         plan_share: share of the joint batches that are planning demonstrations with proprioception.
+        judge_share: share of judging questions among the planning demonstrations.
         questions: body-relative questions packed per image.
         mask: share of motion tokens hidden in masked motion.
     """
@@ -98,6 +102,7 @@ class AlignmentConfig:
     image: LoopConfig
     joint: LoopConfig
     plan_share: float = 0.7
+    judge_share: float = 0.15
     questions: int = 6
     mask: float = 0.3
 

@@ -28,6 +28,7 @@ from proprio_mllm.model.batch import Batch, Collator, Example
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import described_motion, filled_motion, looking, made_motion
+from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views
 
 __all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Phase"]
@@ -69,7 +70,7 @@ class AlignmentData:
         """A batch of one kind from the training rows."""
         if kind == "plan":
             rows = rng.choice(self.demos.split.train, size)
-            return self._collator([self.demos.example(i, self._demo_tokens[i].tolist()) for i in rows])
+            return self._collator([self._plan(int(i), rng) for i in rows])
         if kind == "body":
             return self._collator([self._body(int(i), rng) for i in rng.choice(self.views.split.train, size)])
         if kind == "say_image":
@@ -78,6 +79,12 @@ class AlignmentData:
         rows = rng.choice(self.clips.split.train, size)
         codes = self._encode(np.stack([self.clips.window(int(i), frames, rng) for i in rows]))
         return self._collator([self._motion_text(kind, int(i), code, rng) for i, code in zip(rows, codes, strict=True)])
+
+    def _plan(self, index: int, rng: np.random.Generator) -> Example:
+        codes = self._demo_tokens[index].tolist()
+        if rng.random() < self._cfg.judge_share:
+            return judge_example(self.demos, index, rng, codes)
+        return self.demos.example(index, codes)
 
     def _motion_text(self, kind: Kind, clip: int, codes: Sequence[int], rng: np.random.Generator) -> Example:
         caption = self.clips.caption(clip, rng)

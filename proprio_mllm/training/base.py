@@ -2,7 +2,7 @@
 
 Three parts, each needed (a small model trained on questions alone never binds words to image regions): dense, name-tied
 pretraining of the vision tower on the simulator's truth; grounding questions packed per image and image-to-text listing;
-planning demonstrations without proprioception. Its result is also the table row "Qwen2.5-VL-Ins" at this size. The paper has no
+planning demonstrations without proprioception, with judging questions about the expert's logs among them. Its result is also the table row "Qwen2.5-VL-Ins" at this size. The paper has no
 such stage.
 """
 
@@ -21,6 +21,7 @@ from proprio_mllm.model.batch import Batch, Collator, Example, ImageBatch
 from proprio_mllm.model.dense import DenseHead, DenseTargets, dense_targets
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
+from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.sources import GROUNDING, Demos, Views
 
 __all__ = ["DenseObjective", "JointObjective", "grounding_accuracy", "plan_accuracy"]
@@ -121,7 +122,10 @@ class JointObjective(_Base):
         """A batch of views or of planning steps."""
         if rng.random() >= self._cfg.plan_share:
             return self._view_batch(rng, size, self._cfg.questions)
-        examples = [self._demos.example(i, None) for i in rng.choice(self._demos.split.train, size)]
+        examples = [
+            judge_example(self._demos, i, rng, None) if rng.random() < self._cfg.judge_share else self._demos.example(i, None)
+            for i in rng.choice(self._demos.split.train, size)
+        ]
         return _JointBatch("plan", self._collator(examples), None, None, 0.0)
 
 

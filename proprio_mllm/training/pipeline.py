@@ -21,7 +21,7 @@ from configs.schema.train import LoopConfig, TrainConfig
 from data.shards import ShardReader, decode_motion
 from proprio_mllm.model.building import add_adapter, build_model, build_point_map, build_processor, load_model, save_model
 from proprio_mllm.model.dense import DenseHead
-from proprio_mllm.model.groups import GROUPS, train_only
+from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective

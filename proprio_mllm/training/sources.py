@@ -140,6 +140,10 @@ class Demos:
         self.reader = ShardReader(folder, "demos")
         self.split = _Split(self.reader.column("episode"), folder)
         self.motions = np.stack([decode_motion(m) for m in self.reader.column("motion")])  # (N, T, F)
+        done = np.array([target == "Done()" for target in self.reader.column("target")], dtype=bool)
+        #: Training rows whose expert step ends the episode.
+        self.finals = np.intersect1d(np.flatnonzero(done), self.split.train)
+        self.style = cfg.prompt
         self._cfg = cfg
 
     def tokens(self, tokenizer: MotionTokenizer) -> NDArray[np.int64]:
@@ -163,9 +167,12 @@ class Demos:
             self._cfg.prompt,
             self._cfg.history,
         )
+        return Example(with_answer(prompt, row["target"]) if answered else prompt, (self.view(row),))
+
+    def view(self, row: Mapping[str, Any]) -> View:
+        """The head-camera view of a row."""
         bodies = np.asarray(row["key_bodies"], dtype=np.float64).reshape(KEY_BODY_COUNT, 3)
-        view = View(decode_png(row["image"]), _camera(row, row["camera_in_pelvis"]), bodies)
-        return Example(with_answer(prompt, row["target"]) if answered else prompt, (view,))
+        return View(decode_png(row["image"]), _camera(row, row["camera_in_pelvis"]), bodies)
 
     def target(self, index: int) -> str:
         """The expert's step."""

@@ -1,0 +1,265 @@
+"""The critic of SELU: judges goals, asks itself about states, and turns trajectories into its own and the actor's examples.
+
+The critic is the same model under another LoRA adapter. It reads the last view, the log and the motion tokens of a moment; the
+simulator's truth reaches it only in the labelled ablation `truth=oracle`. Formats and filters that the abstract of SELU leaves
+open are ours: judging every moment to cut a trajectory at its first success, dropping failed steps as targets, caps per class.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from proprio_mllm.model.batch import Collator, Example
+from proprio_mllm.model.building import use_adapter
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.prompts import answers, critic_prompt, plan_prompt, self_ask_prompt, with_answer
+from proprio_mllm.training.goals import Relabel, relabel, verbs_of
+from proprio_mllm.training.judging import LOG_LENGTH
+from proprio_mllm.training.rollouts import Rollout
+
+__all__ = [
+    "CriticExample",
+    "Judge",
+    "Kept",
+    "ModelJudge",
+    "OracleJudge",
+    "Trajectory",
+    "actor_examples",
+    "audit",
+    "critic_examples",
+    "keep",
+]
+
+Motion = Sequence[int] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """A rollout with the motion tokens of every moment (None leaves proprioception out)."""
+
+    rollout: Rollout
+    motion: tuple[Motion, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CriticExample:
+    """One row of the critic's training set: `kind` says where its answer comes from."""
+
+    kind: Literal["direct", "relabel", "negative", "ask"]
+    episode: str
+    example: Example
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A trajectory that the actor learns: its goal, and the moment at which the goal first held."""
+
+    trajectory: Trajectory
+    goal: str
+    end: int
+    relabelled: bool
+
+
+class Judge:
+    """What SELU needs of a critic."""
+
+    def completed(self, queries: Sequence[tuple[Trajectory, int, str]]) -> list[bool]:
+        """Whether each goal holds at a moment of a trajectory."""
+        raise NotImplementedError
+
+    def ask(self, trajectory: Trajectory, relation: str) -> str:
+        """Ids of the objects in a relation at the end, as `prompts.answers` writes them."""
+        raise NotImplementedError
+
+
+class ModelJudge(Judge):
+    """The critic adapter of the model.
+
+    Args:
+        model: the model; its active adapter is switched to the critic's for every call.
+        collator: makes the batches.
+        adapter: name of the critic's adapter.
+        size: questions per forward pass.
+    """
+
+    def __init__(self, model: ProprioMLLM, collator: Collator, adapter: str = "critic", size: int = 16) -> None:
+        self._model, self._collator, self._adapter, self._size = model, collator, adapter, size
+        self._style = model.cfg.prompt
+
+    def completed(self, queries: Sequence[tuple[Trajectory, int, str]]) -> list[bool]:
+        """Greedy replies; anything but `yes` is no."""
+        examples = [Example(judge_prompt(t, at, goal, self._style), (t.rollout.view(at),)) for t, at, goal in queries]
+        return [reply.strip().lower().startswith("yes") for reply in self._reply(examples, 4)]
+
+    def ask(self, trajectory: Trajectory, relation: str) -> str:
+        """Greedy reply to a self-asked question."""
+        at = trajectory.rollout.length
+        example = Example(ask_prompt(trajectory, relation, self._style), (trajectory.rollout.view(at),))
+        return self._reply([example], 24)[0]
+
+    def _reply(self, examples: Sequence[Example], tokens: int) -> list[str]:
+        self._model.eval()
+        use_adapter(self._model, self._adapter)
+        found: list[str] = []
+        for start in range(0, len(examples), self._size):
+            batch = self._collator(examples[start : start + self._size], generation=True).to(self._model.device)
+            found.extend(self._model.reply(batch, tokens))
+        return found
+
+
+class OracleJudge(Judge):
+    """The simulator's truth, for the labelled ablation and for audits; knows the end of a trajectory only."""
+
+    def __init__(self, goals: Mapping[tuple[str, str], Relabel]) -> None:
+        self._goals = goals
+
+    def completed(self, queries: Sequence[tuple[Trajectory, int, str]]) -> list[bool]:
+        """The original goal by the simulator's verdict, relabelled ones by the object relations at the end."""
+        return [at == t.rollout.length and self.truth(t.rollout, goal) is True for t, at, goal in queries]
+
+    def truth(self, rollout: Rollout, goal: str) -> bool | None:
+        """Whether a goal holds at the end; None when the row does not say."""
+        if goal == rollout.instruction:
+            return rollout.success
+        found = self._goals.get((rollout.episode, goal))
+        if found is None or rollout.relations is None:
+            return None
+        names = {"place": "on {}", "lift": "lifted", "turn_on": "switched on", "turn_off": "switched off"}
+        names |= {"close": "closed", "open": "open", "pick": "held"}
+        return all(thing in rollout.relations.get(names[verb].format(place), ()) for verb, thing, place in found.parts)
+
+    def ask(self, trajectory: Trajectory, relation: str) -> str:
+        """The relation's objects at the end that the robot knows of."""
+        rollout = trajectory.rollout
+        known = set(rollout.moments[-1].known)
+        return answers([name for name in (rollout.relations or {}).get(relation, ()) if name in known])
+
+
+def judge_prompt(t: Trajectory, at: int, goal: str, style: Literal["terse", "full"]) -> tuple:
+    """`critic_prompt` about a moment."""
+    moment = t.rollout.moments[at]
+    return critic_prompt(goal, moment.visible, t.rollout.history(at), t.motion[at], style, LOG_LENGTH)
+
+
+def ask_prompt(t: Trajectory, relation: str, style: Literal["terse", "full"]) -> tuple:
+    """`self_ask_prompt` about the end."""
+    at = t.rollout.length
+    return self_ask_prompt(relation, t.rollout.moments[at].visible, t.rollout.history(at), t.motion[at], style, LOG_LENGTH)
+
+
+def critic_examples(
+    trajectories: Sequence[Trajectory], judge: Judge, style: Literal["terse", "full"]
+) -> tuple[list[CriticExample], dict[tuple[str, str], Relabel]]:
+    """Judges, asks itself and relabels.
+
+    Returns:
+        The critic's new examples: yes on the goals it accepts directly, yes on relabelled goals that it confirms, no on the
+        original goal of every other trajectory. And the relabelled goals by (episode, goal).
+    """
+    examples: list[CriticExample] = []
+    goals: dict[tuple[str, str], Relabel] = {}
+
+    def add(kind: Literal["direct", "relabel", "negative"], t: Trajectory, goal: str, answer: str) -> None:
+        end = t.rollout.length
+        messages = with_answer(judge_prompt(t, end, goal, style), answer)
+        examples.append(CriticExample(kind, t.rollout.episode, Example(messages, (t.rollout.view(end),))))
+
+    verdicts = judge.completed([(t, t.rollout.length, t.rollout.instruction) for t in trajectories])
+    for t, done in zip(trajectories, verdicts, strict=True):
+        rollout = t.rollout
+        if done:
+            add("direct", t, rollout.instruction, "yes")
+            continue
+        add("negative", t, rollout.instruction, "no")
+        ask: Callable[[str], str] = lambda relation, t=t: judge.ask(t, relation)
+        found = relabel(rollout.instruction, rollout.moments[-1].known, rollout.receptacles(), ask, (rollout.instruction,))
+        if found is None:
+            continue
+        goals[rollout.episode, found.goal] = found
+        if judge.completed([(t, rollout.length, found.goal)])[0]:
+            add("relabel", t, found.goal, "yes")
+    return examples, goals
+
+
+def keep(
+    trajectories: Sequence[Trajectory], goals: Mapping[tuple[str, str], Relabel], judge: Judge, per_class: int
+) -> list[Kept]:
+    """Re-judges original and relabelled goals; positives are cut at the first moment that the judge accepts.
+
+    Duplicates (same robot, goal and steps) are dropped; at most `per_class` per verbs, robot and category are kept, in order.
+    """
+    candidates = [(t, t.rollout.instruction, False) for t in trajectories]
+    by_episode = {t.rollout.episode: t for t in trajectories}
+    candidates += [(by_episode[episode], goal, True) for episode, goal in goals]
+    verdicts = judge.completed([(t, t.rollout.length, goal) for t, goal, _ in candidates])
+    kept: list[Kept] = []
+    seen: set[tuple[object, ...]] = set()
+    classes: Counter[tuple[object, ...]] = Counter()
+    for (t, goal, relabelled), done in zip(candidates, verdicts, strict=True):
+        if not done or t.rollout.length == 0:
+            continue
+        # A goal can only come true through a step that worked.
+        moments = [at for at in range(1, t.rollout.length) if t.rollout.moments[at - 1].ok]
+        flags = judge.completed([(t, at, goal) for at in moments])
+        end = next((at for at, held in zip(moments, flags, strict=True) if held), t.rollout.length)
+        steps = tuple(moment.step for moment in t.rollout.moments[:end])
+        same = (t.rollout.robot, goal, steps)
+        group = (verbs_of(goal), t.rollout.robot, t.rollout.category)
+        if same in seen or classes[group] >= per_class:
+            continue
+        seen.add(same)
+        classes[group] += 1
+        kept.append(Kept(t, goal, end, relabelled))
+    return kept
+
+
+def actor_examples(kept: Sequence[Kept], style: Literal["terse", "full"], last: int) -> list[Example]:
+    """Planning examples of kept trajectories: every step that worked, and `Done()` once the goal holds."""
+    examples: list[Example] = []
+    for item in kept:
+        t, rollout = item.trajectory, item.trajectory.rollout
+        for at in range(item.end + 1):
+            moment = rollout.moments[at]
+            target = "Done()" if at == item.end else moment.step
+            if at < item.end and (not moment.ok or moment.step == "Done()"):
+                continue
+            prompt = plan_prompt(
+                item.goal,
+                rollout.robot,
+                moment.visible,
+                moment.known,
+                rollout.history(at),
+                at,
+                rollout.step_budget,
+                t.motion[at],
+                style,
+                last,
+            )
+            examples.append(Example(with_answer(prompt, target), (rollout.view(at),)))
+    return examples
+
+
+def audit(trajectories: Sequence[Trajectory], goals: Mapping[tuple[str, str], Relabel], judge: Judge) -> dict[str, float]:
+    """The judge against the simulator's truth at the end: precision, recall and counts, for reports only."""
+    oracle = OracleJudge(goals)
+    by_episode = {t.rollout.episode: t for t in trajectories}
+    queries = [(t, t.rollout.length, t.rollout.instruction) for t in trajectories]
+    queries += [(by_episode[episode], by_episode[episode].rollout.length, goal) for episode, goal in goals]
+    truth = [oracle.truth(t.rollout, goal) for t, _, goal in queries]
+    said = judge.completed(queries)
+    pairs = [(s, t) for s, t in zip(said, truth, strict=True) if t is not None]
+    both = sum(s and t for s, t in pairs)
+    yes, true = sum(s for s, _ in pairs), sum(t for _, t in pairs)
+    return {
+        "judged": float(len(pairs)),
+        "said_yes": float(yes),
+        "truly_yes": float(true),
+        "accuracy": float(np.mean([s == t for s, t in pairs])) if pairs else float("nan"),
+        "precision": both / yes if yes else float("nan"),
+        "recall": both / true if true else float("nan"),
+    }

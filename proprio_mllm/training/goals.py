@@ -1,0 +1,144 @@
+"""Goals in words: the verbs of an instruction, hindsight relabelling that keeps them, and replies to self-asked questions.
+
+SELU (stage 3) judges an instruction by its words alone. When the critic says that it was not completed, it asks itself which
+objects *are* in the state that the verb aims at, and the instruction is rewritten with the same verb and that object. Everything
+here is text: no simulator state is read. The sentences and the set of verbs are ours; the paper gives the principle.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+__all__ = ["VERBS", "Relabel", "Verb", "natural_name", "parse_ids", "relabel", "verbs_of"]
+
+_OBJECT_ID = re.compile(r"^[A-Za-z][A-Za-z0-9]{0,39}_[1-9][0-9]?$")
+_WORDS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|[0-9]+")
+_ENCLOSING: Final = frozenset(
+    ("Box", "Bowl", "Cabinet", "Cup", "Drawer", "Fridge", "GarbageCan", "LaundryHamper", "Microwave", "Mug", "Pot", "SinkBasin")
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Verb:
+    """One verb.
+
+    Attributes:
+        name: its key in `VERBS`.
+        pattern: what shows it in an instruction.
+        relation: the state it aims at, as `prompts.self_ask_prompt` takes it; `{}` stands for a receptacle.
+        sentence: instruction with this verb; slots a (object), pr (preposition), r (receptacle).
+    """
+
+    name: str
+    pattern: re.Pattern[str]
+    relation: str
+    sentence: str
+
+
+def _verb(name: str, pattern: str, relation: str, sentence: str) -> Verb:
+    return Verb(name, re.compile(pattern, re.IGNORECASE), relation, sentence)
+
+
+#: Verbs by name. An instruction may have several (one per sub-goal).
+VERBS: Final[Mapping[str, Verb]] = {
+    verb.name: verb
+    for verb in (
+        _verb("place", r"\b(put|place|move|bring|set|belongs?|goes|stow|store)\b", "on {}", "Put {a} {pr} {r}."),
+        _verb("lift", r"\blift\b|\b(both|two) hands\b", "lifted", "Lift {a}."),
+        _verb("turn_on", r"\b(turn|turning|switch|switching)\b.*?\bon\b|\brunning\b", "switched on", "Turn on {a}."),
+        _verb("turn_off", r"\b(turn|turning|switch|switching)\b.*?\boff\b|\bshould be off\b", "switched off", "Turn off {a}."),
+        _verb("close", r"\b(close|shut|closed)\b|\bnot stay open\b", "closed", "Close {a}."),
+        _verb("open", r"(?<!not stay )\bopen\b", "open", "Open {a}."),
+        _verb("pick", r"\b(pick|take|grab|get|hold of|in your hand)\b", "held", "Pick up {a}."),
+    )
+}
+#: Verbs that are only means when the first one is there: opening a fridge to put something in, picking to place.
+_MEANS: Final = (("place", "open"), ("place", "pick"), ("lift", "pick"), ("close", "open"))
+
+
+def verbs_of(instruction: str) -> tuple[str, ...]:
+    """Names of the verbs that an instruction aims at, in the order of `VERBS`; empty when it shows none."""
+    text = instruction.replace(", which is closed", "")
+    found = [name for name, verb in VERBS.items() if verb.pattern.search(text)]
+    if "place" in found and re.search(r"\bset (both )?hands\b", text):
+        found.remove("place")
+    for strong, means in _MEANS:
+        if strong in found and means in found:
+            found.remove(means)
+    return tuple(found)
+
+
+def natural_name(object_id: str) -> str:
+    """`CoffeeTable_1` as `the coffee table`."""
+    words = _WORDS.findall(object_id.rpartition("_")[0])
+    return "the " + " ".join(word if word.isupper() and len(word) > 1 else word.lower() for word in words)
+
+
+def parse_ids(reply: str, inventory: Sequence[str]) -> tuple[str, ...]:
+    """Object ids of a self-asked reply, in order and without repeats.
+
+    What is not an id, or not in the inventory, is dropped: the critic may imagine objects, the relabelled goal must not.
+    """
+    allowed = set(inventory)
+    found = [part.strip().rstrip(".") for part in reply.split(",")]
+    return tuple(dict.fromkeys(name for name in found if _OBJECT_ID.match(name) and name in allowed))
+
+
+@dataclass(frozen=True, slots=True)
+class Relabel:
+    """A rewritten goal: its sentence, its verbs with the objects found for them, and what was asked and answered."""
+
+    goal: str
+    parts: tuple[tuple[str, str, str], ...]
+    asked: tuple[tuple[str, str], ...]
+
+
+def relabel(
+    instruction: str, inventory: Sequence[str], receptacles: Sequence[str], ask: Callable[[str], str], avoid: Sequence[str] = ()
+) -> Relabel | None:
+    """Hindsight: the same verbs with objects for which they came true.
+
+    Args:
+        instruction: the goal that was judged not completed.
+        inventory: ids known to the robot.
+        receptacles: ids that the robot tried to place something on or in, newest first; only these are asked about.
+        ask: answers a relation (`open`, `on Table_1`) with ids, `prompts.answers` format.
+        avoid: goals that must not come out, such as the original one.
+
+    Returns:
+        The goal, or None when no verb found an object whose type is unique in the inventory.
+    """
+    parts: list[tuple[str, str, str]] = []
+    sentences: list[str] = []
+    asked: list[tuple[str, str]] = []
+    for name in verbs_of(instruction):
+        verb = VERBS[name]
+        places = [place for place in receptacles if place in inventory] if "{}" in verb.relation else [""]
+        for place in places:
+            relation = verb.relation.format(place)
+            reply = ask(relation)
+            asked.append((relation, reply))
+            things = [thing for thing in parse_ids(reply, inventory) if _unique(thing, inventory) and thing != place]
+            if not things or (place and not _unique(place, inventory)):
+                continue
+            preposition = "in" if place.rpartition("_")[0] in _ENCLOSING else "on"
+            slots = {"a": natural_name(things[0]), "r": natural_name(place) if place else "", "pr": preposition}
+            parts.append((name, things[0], place))
+            sentences.append(verb.sentence.format(**slots))
+            break
+    if not sentences:
+        return None
+    goal = " and ".join([sentences[0][:-1], *(_lowered(sentence) for sentence in sentences[1:])]) + "."
+    return None if goal in avoid else Relabel(goal, tuple(parts), tuple(asked))
+
+
+def _lowered(sentence: str) -> str:
+    return sentence[0].lower() + sentence[1:-1]
+
+
+def _unique(thing: str, inventory: Sequence[str]) -> bool:
+    kind = thing.rpartition("_")[0]
+    return sum(name.rpartition("_")[0] == kind for name in set(inventory)) == 1

@@ -1,0 +1,109 @@
+"""Judging exercises from expert logs: was the goal completed, and which objects are in a state.
+
+A released model can answer such questions; the tiny one has to learn it. The answers come from what the log itself says (an
+action with `ok`, or the expert's `Done()`), never from privileged simulator state, so a judge learns to read its inputs only.
+
+Shape letters: none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from data.records import Action, ActionError, HistoryItem
+from proprio_mllm.model.batch import Example
+from proprio_mllm.model.prompts import answers, critic_prompt, self_ask_prompt, with_answer
+from proprio_mllm.training.sources import Demos
+
+__all__ = ["LOG_LENGTH", "judge_example", "states_from_log"]
+
+#: Earlier steps shown to a judge.
+LOG_LENGTH: Final = 8
+_SWITCHES: Final = {"Open": "open", "Close": "closed", "ToggleOn": "switched on", "ToggleOff": "switched off", "Lift": "lifted"}
+_OPPOSITE: Final = {"open": "closed", "closed": "open", "switched on": "switched off", "switched off": "switched on"}
+
+
+def states_from_log(history: Sequence[HistoryItem]) -> dict[str, tuple[str, ...]]:
+    """Objects in each relation according to the successful actions of a log.
+
+    Relations: `held`, `lifted`, `open`, `closed`, `switched on`, `switched off`, and `on R` for receptacles R.
+    """
+    hands: dict[str, str] = {}
+    lifted = ""
+    found: dict[str, list[str]] = {name: [] for name in _SWITCHES.values()}
+
+    def move(thing: str, place: str | None) -> None:
+        for name, things in found.items():
+            if name.startswith("on ") and thing in things:
+                things.remove(thing)
+        if place is not None:
+            found.setdefault(f"on {place}", []).append(thing)
+
+    for item in history:
+        for part in item.feedback.split(";"):
+            text, _, result = part.strip().rpartition(" ")
+            try:
+                action = Action.parse(text)
+            except ActionError:
+                continue
+            thing = action.object_id or ""
+            if result != "ok":
+                continue
+            if action.name == "Pick" and action.arm is not None:
+                hands[action.arm.value] = thing
+                move(thing, None)
+            elif action.name == "Place" and action.arm is not None:
+                held = hands.pop(action.arm.value, None)
+                if held:
+                    move(held, thing)
+            elif action.name == "PlaceBoth":
+                if lifted:
+                    move(lifted, thing)
+                    found["lifted"] = []
+                lifted = ""
+            elif action.name in _SWITCHES:
+                relation = _SWITCHES[action.name]
+                if action.name == "Lift":
+                    lifted = thing
+                    move(thing, None)
+                opposite = found.get(_OPPOSITE.get(relation, ""), [])
+                if thing in opposite:
+                    opposite.remove(thing)
+                if thing not in found[relation]:
+                    found[relation].append(thing)
+    found["held"] = list(hands.values())
+    return {name: tuple(things) for name, things in found.items()}
+
+
+def judge_example(demos: Demos, index: int, rng: np.random.Generator, motion: Sequence[int] | None) -> Example:
+    """A judging conversation about the state before expert step `index`, with its answer.
+
+    Half of them ask whether a goal was completed: the episode's own (yes exactly when the expert's next step is `Done()`) or
+    another episode's instruction; the others ask which objects are in a relation.
+    """
+    row = demos.reader[int(index)]
+    style = demos.style
+    if rng.random() < 0.5 and len(demos.finals):
+        row = demos.reader[int(rng.choice(demos.finals))] if rng.random() < 0.5 else row
+        goal, done = row["instruction"], row["target"] == "Done()"
+        if done and rng.random() < 0.35:
+            other = demos.reader[int(rng.choice(demos.finals))]["instruction"]
+            done = other == goal
+            goal = other
+        history = _history(row)
+        prompt = critic_prompt(goal, row["visible"], history, motion, style, LOG_LENGTH)
+        return Example(with_answer(prompt, "yes" if done else "no"), (demos.view(row),))
+    history = _history(row)
+    states = states_from_log(history[-LOG_LENGTH:])
+    full = [name for name, things in states.items() if things]
+    names = full if full and rng.random() < 0.7 else sorted(states)
+    relation = names[int(rng.integers(len(names)))]
+    prompt = self_ask_prompt(relation, row["visible"], history, motion, style, LOG_LENGTH)
+    return Example(with_answer(prompt, answers(states[relation])), (demos.view(row),))
+
+
+def _history(row: dict) -> list[HistoryItem]:
+    return [HistoryItem(item["step"], item["feedback"]) for item in row["history"]]

@@ -1,0 +1,115 @@
+"""Released weights: a finished stage's model as a small folder with where it comes from, and how a loader finds it.
+
+    weights/<model>/<name>/     what `building.save_model` wrote, and
+        provenance.json         command, seed, stage, keys and hashes of data and configuration, metrics, versions
+
+Git is not asked: hashes of data and configuration say what made the weights.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+import shutil
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from proprio_mllm.training.paths import finished_key
+from proprio_mllm.training.sources import shard_hash
+
+if TYPE_CHECKING:
+    from proprio_mllm.training.pipeline import Pipeline
+
+__all__ = ["LARGEST_MB", "export", "find_model", "release_name"]
+
+#: Largest size of one released folder, megabytes.
+LARGEST_MB: Final = 30.0
+_MODELS: Final = ("base", "alignment", "selu")
+
+
+def release_name(stage: str, variant: str) -> str:
+    """Name of a released model: `base`, the variant for the last stage's model, `full-alignment` for the one before."""
+    return {"base": "base", "selu": variant}.get(stage, f"{variant}-{stage}")
+
+
+def export(pipeline: Pipeline, folder: str | Path, command: str) -> list[Path]:
+    """Copies every finished model of a pipeline's configuration to `folder/<model>/<name>`.
+
+    Args:
+        pipeline: names folders and keys.
+        folder: such as `weights`.
+        command: the command line that made them.
+
+    Returns:
+        The written folders.
+
+    Raises:
+        ValueError: when a folder would be larger than `LARGEST_MB`.
+    """
+    paths, written = pipeline.paths, []
+    for stage in _MODELS:
+        source, key = paths.model(stage), finished_key(paths.stage(stage))
+        if key is None or not source.is_dir():
+            continue
+        target = Path(folder) / pipeline.cfg.model.name / release_name(stage, pipeline.cfg.variant)
+        work = target.with_name(target.name + ".tmp")
+        shutil.rmtree(work, ignore_errors=True)
+        shutil.copytree(source, work)
+        metrics = json.loads((paths.stage(stage) / "done.json").read_text(encoding="utf-8"))["metrics"]
+        (work / "provenance.json").write_text(json.dumps(_provenance(pipeline, stage, key, command, metrics), indent=1) + "\n")
+        size = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) / 1e6
+        if size > LARGEST_MB:
+            shutil.rmtree(work)
+            raise ValueError(f"{target}: {size:.1f} MB; at most {LARGEST_MB:g} MB are released")
+        shutil.rmtree(target, ignore_errors=True)
+        os.replace(work, target)
+        written.append(target)
+    return written
+
+
+def _provenance(pipeline: Pipeline, stage: str, key: str, command: str, metrics: dict[str, Any]) -> dict[str, Any]:
+    shards = {}
+    for kind in ("clips", "views", "demos"):
+        folder = pipeline.paths.shards(kind)
+        if (folder / "manifest.json").is_file():
+            shards[kind] = shard_hash(folder)
+    return {
+        "stage": stage,
+        "variant": pipeline.cfg.variant,
+        "key": key,
+        "command": command,
+        "seed": pipeline.cfg.seed,
+        "shards": shards,
+        "metrics": metrics,
+        "config": dataclasses.asdict(pipeline.cfg),
+        "versions": {name: version(name) for name in ("torch", "transformers", "peft")} | {"python": platform.python_version()},
+    }
+
+
+def find_model(output: str | Path, weights: str | Path, model: str, variant: str, stage: str) -> Path:
+    """The folder of a model: this machine's training output when there is one, otherwise the released weights.
+
+    Args:
+        output: the training output root.
+        weights: the released weights' root.
+        model: model name.
+        variant: variant.
+        stage: `base`, `alignment` or `selu`.
+
+    Raises:
+        FileNotFoundError: when neither exists; the message names the command that trains it.
+    """
+    group = "shared" if stage == "base" else variant
+    trained = Path(output) / model / group / stage
+    if finished_key(trained) is not None and (trained / "model").is_dir():
+        return trained / "model"
+    released = Path(weights) / model / release_name(stage, variant)
+    if (released / "config.json").is_file():
+        return released
+    raise FileNotFoundError(
+        f"no {stage} model of {model} ({variant}): neither {trained / 'model'} nor {released}; "
+        f"train it with `python train.py stage=all model={model} variant={variant}`"
+    )

@@ -1,0 +1,232 @@
+"""`stage=selu` (paper, stage 3): the actor explores, the critic judges and relabels, both learn from what is kept.
+
+Actor and critic are two LoRA adapters over the stage-2 model: the actor goes on with stage 2's adapter, the critic starts as its
+copy. A round: roll the actor out with a temperature, judge every end, ask oneself and relabel failures keeping the verb,
+fine-tune the critic, judge again, fine-tune the actor on the kept trajectories. Before the first round the critic practises on
+questions about the expert's logs. The critic's agreement with the simulator is reported and, unless `truth=oracle`, never used.
+Part of each batch is replayed demonstrations against forgetting; the abstract of SELU mentions no replay.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from configs.schema.train import LoopConfig
+from data.shards import config_hash
+from proprio_mllm.model.batch import Batch, Collator, Example
+from proprio_mllm.model.building import add_adapter, load_model, save_model, use_adapter
+from proprio_mllm.model.groups import train_only
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.training.critic import (
+    Judge,
+    ModelJudge,
+    OracleJudge,
+    Trajectory,
+    actor_examples,
+    audit,
+    critic_examples,
+    keep,
+)
+from proprio_mllm.training.judging import judge_example
+from proprio_mllm.training.paths import finish, finished_key
+from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
+from proprio_mllm.training.sources import Demos
+
+if TYPE_CHECKING:
+    from proprio_mllm.training.pipeline import Pipeline
+
+__all__ = ["ACTOR", "CRITIC", "ExampleObjective", "copy_adapter", "run_selu", "train_adapter"]
+
+logger = logging.getLogger(__name__)
+
+#: Adapter names; the actor's is the one that stage 2 trained.
+ACTOR, CRITIC = "default", "critic"
+
+
+class ExampleObjective:
+    """Fine-tuning of one adapter on stored examples, with a share of freshly drawn ones."""
+
+    def __init__(
+        self,
+        name: str,
+        model: ProprioMLLM,
+        examples: Sequence[Example],
+        replay: Callable[[np.random.Generator], Example],
+        replay_share: float,
+        key: str,
+    ) -> None:
+        self.name, self.key = name, key
+        self.module: nn.Module = model
+        self._examples, self._replay = list(examples), replay
+        self._share = replay_share if self._examples else 1.0
+        self._collator = Collator(model.processor, model.cfg)
+
+    def batch(self, rng: np.random.Generator, size: int) -> Batch:
+        """Stored and replayed examples."""
+        drawn = rng.random(size) < self._share
+        return self._collator(
+            [self._replay(rng) if fresh else self._examples[int(rng.integers(len(self._examples)))] for fresh in drawn]
+        )
+
+    def loss(self, module: nn.Module, batch: Batch, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
+        """Cross-entropy over the answers; nothing is drawn."""
+        del generator
+        out = module(batch)
+        return out.loss, {"accuracy": out.correct / max(out.supervised, 1)}
+
+
+def copy_adapter(model: ProprioMLLM, source: str, target: str) -> None:
+    """Copies one adapter's weights to another of the same shape.
+
+    Raises:
+        ValueError: when either adapter has no weights in the model.
+    """
+    state = dict(model.named_parameters())
+    copied = 0
+    with torch.no_grad():
+        for name, parameter in state.items():
+            other = name.replace(f".{source}.", f".{target}.") if f".{source}." in name else _ending(name, source, target)
+            if other != name and other in state:
+                state[other].copy_(parameter)
+                copied += 1
+    if not copied:
+        raise ValueError(f"no weights of adapter {source!r} to copy to {target!r}")
+
+
+def _ending(name: str, source: str, target: str) -> str:
+    return name.removesuffix(source) + target if name.endswith(f".{source}") else name
+
+
+def train_adapter(model: ProprioMLLM, name: str) -> list[nn.Parameter]:
+    """Makes an adapter active and the only thing that trains; returns its parameters."""
+    use_adapter(model, name)
+    train_only(model, ("lora", "rows"))
+    chosen = []
+    for key, parameter in model.named_parameters():
+        mine = f".{name}." in key or key.endswith(f".{name}")
+        parameter.requires_grad_(parameter.requires_grad and mine)
+        if parameter.requires_grad:
+            chosen.append(parameter)
+    return chosen
+
+
+def _trajectories(rollouts: Sequence[Rollout], tokenizer: MotionTokenizer | None) -> list[Trajectory]:
+    found = []
+    for rollout in rollouts:
+        motion = tuple(None if tokenizer is None else tokenizer.encode_window(window) for window in rollout.motions)
+        found.append(Trajectory(rollout, motion))
+    return found
+
+
+class _Selu:
+    """State of one run of the stage."""
+
+    def __init__(self, pipeline: Pipeline, folder: Path, key: str, collect: RolloutCollector) -> None:
+        self.pipeline, self.cfg, self.folder, self.key, self.collect = pipeline, pipeline.cfg.selu, folder, key, collect
+        self.start = pipeline.paths.model("alignment")
+
+    def load(self, folder: Path, demos_folder: Path) -> None:
+        """Loads a model with both adapters; the critic is made when it is missing."""
+        self.model = load_model(folder, trainable=True)
+        self.tokenizer = MotionTokenizer.load(folder / "motion") if self.model.cfg.proprioception else None
+        peft: Any = self.model.vlm
+        if CRITIC not in peft.peft_config:
+            add_adapter(self.model, CRITIC)
+            copy_adapter(self.model, ACTOR, CRITIC)
+        self.collator = Collator(self.model.processor, self.model.cfg)
+        self.demos = Demos(demos_folder, self.model.cfg)
+        self._tokens = None if self.tokenizer is None else self.demos.tokens(self.tokenizer)
+
+    def _codes(self, index: int) -> list[int] | None:
+        return None if self._tokens is None else self._tokens[index].tolist()
+
+    def _judging(self, rng: np.random.Generator) -> Example:
+        index = int(rng.choice(self.demos.split.train))
+        return judge_example(self.demos, index, rng, self._codes(index))
+
+    def _planning(self, rng: np.random.Generator) -> Example:
+        index = int(rng.choice(self.demos.split.train))
+        return self.demos.example(index, self._codes(index))
+
+    def tune(self, adapter: str, name: str, examples: Sequence[Example], loop: LoopConfig, share: float, folder: Path) -> None:
+        """Fine-tunes one adapter."""
+        train_adapter(self.model, adapter)
+        replay = self._judging if adapter == CRITIC else self._planning
+        key = config_hash({"key": self.key, "name": name, "examples": len(examples)})
+        objective = ExampleObjective(name, self.model, examples, replay, share, key)
+        self.pipeline.loop(objective, loop, folder)
+
+    def round(self, number: int) -> dict[str, float]:
+        """One round; its folder holds rollouts, the two runs, the model and its metrics."""
+        folder, key = self.folder / f"round_{number}", f"{self.key}/{number}"
+        if finished_key(folder) == key:
+            logger.info("selu: round %d is complete", number)
+            return json.loads((folder / "done.json").read_text(encoding="utf-8"))["metrics"]
+        before = self.start if number == 0 else self.folder / f"round_{number - 1}" / "model"
+        seed = self.pipeline.cfg.seed * 1000 + number
+        request = RolloutRequest(
+            before, folder / "rollouts", self.cfg.episodes, seed, self.cfg.temperature, config_hash({"key": key})
+        )
+        self.collect(request)
+        self.load(before, self.pipeline.paths.shards("demos"))
+        if number == 0:
+            self.tune(CRITIC, "selu/practice", [], self.cfg.critic, 1.0, folder / "practice")
+        style, last = self.model.cfg.prompt, self.model.cfg.history
+        trajectories = _trajectories(read_rollouts(request.folder), self.tokenizer)
+        if not trajectories:
+            raise ValueError(f"{request.folder}: the collector wrote no episode")
+        oracle = OracleJudge({})
+        judge: Judge = oracle if self.cfg.truth == "oracle" else ModelJudge(self.model, self.collator, CRITIC)
+        learnt, goals = critic_examples(trajectories, judge, style)
+        metrics = {f"before_{name}": value for name, value in audit(trajectories, {}, judge).items()}
+        for kind in ("direct", "relabel", "negative"):
+            metrics[f"critic_{kind}"] = float(sum(one.kind == kind for one in learnt))
+        self.tune(
+            CRITIC, "selu/critic", [one.example for one in learnt], self.cfg.critic, self.cfg.replay_share, folder / "critic"
+        )
+        if self.cfg.truth == "oracle":
+            judge = OracleJudge(goals)
+        kept = keep(trajectories, goals, judge, self.cfg.per_class)
+        metrics |= {f"after_{name}": value for name, value in audit(trajectories, goals, judge).items()}
+        steps = actor_examples(kept, style, last)
+        metrics |= {
+            "episodes": float(len(trajectories)),
+            "actor_success": float(np.mean([t.rollout.success for t in trajectories])),
+            "kept": float(len(kept)),
+            "kept_relabelled": float(sum(item.relabelled for item in kept)),
+            "actor_steps": float(len(steps)),
+        }
+        self.tune(ACTOR, "selu/actor", steps, self.cfg.actor, self.cfg.replay_share, folder / "actor")
+        use_adapter(self.model, ACTOR)
+        save_model(self.model.eval(), folder / "model", self.tokenizer)
+        finish(folder, key, metrics)
+        return metrics
+
+
+def run_selu(pipeline: Pipeline, folder: Path, key: str, collect: RolloutCollector) -> dict[str, float]:
+    """Runs the rounds, continuing an interrupted one, and stores the last round's model.
+
+    Args:
+        pipeline: gives configuration, folders and the loop.
+        folder: of this stage.
+        key: of this stage.
+        collect: runs an actor in the simulator.
+    """
+    run = _Selu(pipeline, folder, key, collect)
+    metrics: dict[str, float] = {}
+    for number in range(pipeline.cfg.selu.rounds):
+        metrics |= {f"round{number}_{name}": value for name, value in run.round(number).items()}
+    last = folder / f"round_{pipeline.cfg.selu.rounds - 1}" / "model"
+    model = load_model(last, ACTOR)
+    tokenizer = MotionTokenizer.load(last / "motion") if model.cfg.proprioception else None
+    save_model(model, pipeline.paths.model("selu"), tokenizer)
+    return metrics
