@@ -41,7 +41,7 @@ class Canvas:
             raise RenderingError(
                 f"no OpenGL context with MUJOCO_GL={os.environ.get('MUJOCO_GL')}: {error}. "
                 "Install libegl1 (MUJOCO_GL=egl) "
-                "or libosmesa6 (MUJOCO_GL=osmesa), for example: apt-get install libegl1 libgl1-mesa-dri libosmesa6. A program that "
+                "or libosmesa6 (MUJOCO_GL=osmesa): apt-get install libegl1 libgl1-mesa-dri libosmesa6. A program that "
                 "imports mujoco before sim must set MUJOCO_GL itself."
             ) from error
         mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._context)
