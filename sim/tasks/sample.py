@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -18,9 +17,11 @@ from numpy.typing import NDArray
 
 from sim.catalogue import ObjectType, load_catalogue
 from sim.navigation import NavigationMap
+from sim.robots.build_solver import robot_kit
 from sim.robots.spec import load_robot
 from sim.rooms import load_room
 from sim.skills.obstacles import navigation_map
+from sim.skills.reach_map import reach_maps
 from sim.tasks.drafts import FAMILIES, Draft, NoDraft, Scene, category_of, draw
 from sim.tasks.task import Placement, Start, Task
 from sim.world import World, WorldError
@@ -41,7 +42,7 @@ _SMALL_TYPES: Final = (
 )  # fmt: skip
 #: Types that tasks carry with both hands.
 _BIG_TYPES: Final = ("Box", "HousePlant", "Pot")
-_SURFACE_TYPES: Final = ("CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser", "TVStand", "Shelf", "Sofa")
+_SURFACE_TYPES: Final = ("CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser", "TVStand", "Shelf")
 _CONTAINER_TYPES: Final = ("Fridge", "Cabinet", "Drawer", "Microwave")
 _SWITCH_TYPES: Final = ("Faucet", "StoveKnob", "Microwave", "FloorLamp", "Television", "LightSwitch")
 
@@ -56,7 +57,12 @@ _START_CLEARANCE_M: Final = 0.05
 #: An object farther away than this, or farther off the heading, does not count as seen at the start.
 _SEEN_DISTANCE_M: Final = (0.6, 2.0)
 _SEEN_BEARING_RAD: Final = np.deg2rad(25.0)
-_ATTEMPTS: Final = 40
+_ATTEMPTS: Final = 60
+#: Depth from the edge of a surface within which tasks put objects: the shorter robot's arms do not reach farther.
+_EDGE_BAND_M: Final = 0.16
+#: Free distance between two objects of a task: a hand fits between.
+_HAND_GAP_M: Final = 0.09
+_REACH_MARGIN_M: Final = 0.02
 
 
 def rng_for(*key: object) -> np.random.Generator:
@@ -104,7 +110,13 @@ def _fits(kind: ObjectType, place: ObjectType) -> bool:
     return any(min(s.rect[2], s.rect[3]) / 2.0 >= radius and (s.clearance >= height or not s.inside) for s in surfaces)
 
 
-def sample_task(seed: int, room: str | None = None, family: str | None = None, split: str = "train") -> Task:
+def sample_task(
+    seed: int,
+    room: str | None = None,
+    family: str | None = None,
+    split: str = "train",
+    robots: Sequence[str] = ROBOTS,
+) -> Task:
     """A task drawn from a seed.
 
     Args:
@@ -112,6 +124,7 @@ def sample_task(seed: int, room: str | None = None, family: str | None = None, s
         room: one of `ROOMS`; drawn when None.
         family: a name of `sim.tasks.drafts.FAMILIES`; drawn when None (category first, then family).
         split: `train` or `benchmark`.
+        robots: robots that have to reach everything the task is about.
 
     Raises:
         ValueError: when the seed belongs to another split, or nothing suitable was drawn.
@@ -125,33 +138,39 @@ def sample_task(seed: int, room: str | None = None, family: str | None = None, s
         what = family or str(rng.choice(FAMILIES[str(rng.choice(list(FAMILIES)))]))
         try:
             draft = draw(what, scene_of(where), rng)
-            return settle(draft, f"{split}_{what}_{seed}", seed, split, rng)
+            return settle(draft, f"{split}_{what}_{seed}", seed, split, rng, robots)
         except (NoDraft, WorldError):
             if room is not None and family is not None and attempt == _ATTEMPTS - 1:
                 raise
     raise ValueError(f"no task of family {family!r} in room {room!r} from seed {seed} in {_ATTEMPTS} attempts")
 
 
-def settle(draft: Draft, task_id: str, seed: int, split: str, rng: np.random.Generator) -> Task:
+def settle(draft: Draft, task_id: str, seed: int, split: str, rng: np.random.Generator, robots: Sequence[str] = ROBOTS) -> Task:
     """Gives a draft positions, a start, words and a budget.
 
     Raises:
-        WorldError: when the objects do not fit.
+        WorldError: when the objects do not fit, or one of the robots cannot reach what it has to touch from anywhere.
     """
     scene = scene_of(draft.room)
-    wishes = [
-        Placement(name, name.rsplit("_", 1)[0], carrier, yaw_deg=_yaw_deg(rng), state=draft.object_states.get(name, {}))
-        for name, carrier in draft.objects.items()
-    ]
-    world = World(None, draft.room, wishes, states=draft.states, seed=int(rng.integers(2**31)), settle_s=0.05)
-    positions = {name: world.pose(name)[:2, 3] for name in world.objects}
+    empty = _empty_world(draft.room)
+    spots = _spots(empty, draft, rng)
     placements = tuple(
-        replace(wish, xy=(round(float(positions[wish.object_id][0]), 3), round(float(positions[wish.object_id][1]), 3)))
-        for wish in wishes
-    )
-    radius = max(load_robot(name).footprint_radius_m for name in ROBOTS)
-    focus = [positions[name] for name in draft.focus.values()]
-    start = _draw_start(navigation_map(world, radius + _START_CLEARANCE_M), focus[0], rng)
+        Placement(
+            name, name.rsplit("_", 1)[0], carrier, (round(float(spots[name][0]), 3), round(float(spots[name][1]), 3)),
+            _yaw_deg(rng, empty, name, carrier), draft.object_states.get(name, {}),
+        )
+        for name, carrier in draft.objects.items()
+    )  # fmt: skip
+    world = World(None, draft.room, placements, states=draft.states, seed=seed % 2**31, settle_s=0.05)
+    points = {name: _hand_point(world, name, draft) for name in draft.focus.values()}
+    for name in robots:
+        navigation = navigation_map(world, load_robot(name).footprint_radius_m)
+        for object_id, point in points.items():
+            if point is not None and not _in_reach(name, navigation, point):
+                raise WorldError(f"{name} does not reach {object_id} at {point.round(2)} in {draft.room}")
+    positions = {name: world.center(name)[:2] for name in world.objects}
+    radius = max(load_robot(name).footprint_radius_m for name in robots)
+    start = _draw_start(navigation_map(world, radius + _START_CLEARANCE_M), positions[draft.focus["a"]], rng)
     hidden = [name for name, carrier in draft.objects.items() if not _in_view(start, positions[name], draft, carrier)]
     sentences = draft.sentences(scene.furniture, rng, hidden)
     typical = _TYPICAL_STEPS[draft.family]
@@ -172,9 +191,82 @@ def settle(draft: Draft, task_id: str, seed: int, split: str, rng: np.random.Gen
     )
 
 
-def _yaw_deg(rng: np.random.Generator) -> float:
-    """Objects stand roughly square to the furniture, as people put them."""
-    return float(rng.choice((0.0, 90.0, 180.0, 270.0))) + float(rng.integers(-3, 4)) * 5.0
+@functools.cache
+def _empty_world(room: str) -> World:
+    return World(None, room, (), settle_s=0.005)
+
+
+def _spots(empty: World, draft: Draft, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
+    """A place for every object near the reachable edge of its carrier, with room for a hand between neighbours.
+
+    Raises:
+        WorldError: when a carrier is too full.
+    """
+    catalogue = load_catalogue()
+    spots: dict[str, NDArray[np.float64]] = {}
+    taken: list[tuple[NDArray[np.float64], float, str]] = []
+    for name, carrier in draft.objects.items():
+        kind = catalogue.get(name.rsplit("_", 1)[0])
+        radius, narrow = float(np.hypot(kind.size[0], kind.size[1])) / 2.0, min(kind.size[0], kind.size[1]) / 2.0
+        band = max(_EDGE_BAND_M, narrow + 0.05)
+        thing = empty.object(carrier)
+        was_open, thing.openness = thing.openness, 1.0
+        for _ in range(12):
+            spot = empty.free_spot(carrier, narrow, height_m=kind.size[2], rng=rng, band_m=band, gap_m=0.04)
+            if spot is not None and all(
+                other != carrier or float(np.linalg.norm(spot[:2] - place)) > radius + size + _HAND_GAP_M
+                for place, size, other in taken
+            ):
+                spots[name] = spot
+                taken.append((spot[:2], radius, carrier))
+                break
+        thing.openness = was_open
+        if name not in spots:
+            raise WorldError(f"no room for {name} on {carrier} in {draft.room}")
+    return spots
+
+
+def _hand_point(world: World, object_id: str, draft: Draft) -> NDArray[np.float64] | None:
+    """Where a hand has to get to for an object of the task, None for surfaces, which offer many points."""
+    thing = world.object(object_id)
+    goal = next((goal for goal in draft.goals if goal.object_id == object_id), None)
+    if thing.movable:
+        return world.center(object_id)
+    if goal is not None and goal.kind.startswith("toggled"):
+        return world.toggle_point(object_id)
+    return world.handle(object_id) if thing.moving else None
+
+
+@functools.cache
+def _reach_limit_m(robot: str, level_cm: int) -> float:
+    """Farthest horizontal distance from the pelvis at which some arm at some pelvis height reaches a level straight ahead."""
+    kit, maps = robot_kit(robot), reach_maps(robot)
+    low, high = kit.spec.pelvis_height_range_m
+    best = 0.0
+    for height in np.linspace(low, high, 6):
+        pitch = kit.crouches.pitch(float(height))
+        c, s = np.cos(pitch), np.sin(pitch)
+        upright = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
+        for distance in np.arange(0.3, 0.9, 0.02):
+            if distance > best and maps["right"].contains(upright @ np.array([distance, -0.05, level_cm / 100.0 - height])):
+                best = float(distance)
+    return best
+
+
+def _in_reach(robot: str, navigation: NavigationMap, point: NDArray[np.float64]) -> bool:
+    """Whether the robot can stand somewhere from where an arm gets to a point."""
+    free = navigation.free_positions()
+    gap = float(np.linalg.norm(free - point[:2], axis=1).min())
+    return gap <= _reach_limit_m(robot, round(float(point[2]) * 20.0) * 5) - _REACH_MARGIN_M
+
+
+def _yaw_deg(rng: np.random.Generator, empty: World, name: str, carrier: str) -> float:
+    """Small objects stand roughly square to the furniture; big ones with their long side along its front, within reach."""
+    rotation = empty.pose(carrier)[:2, :2]
+    along = float(np.rad2deg(np.arctan2(rotation[1, 0], rotation[0, 0])))
+    if name.rsplit("_", 1)[0] in _BIG_TYPES:
+        return along
+    return along + float(rng.choice((0.0, 90.0, 180.0, 270.0))) + float(rng.integers(-3, 4)) * 5.0
 
 
 def _draw_start(navigation: NavigationMap, target: NDArray[np.float64], rng: np.random.Generator) -> Start:

@@ -1,0 +1,151 @@
+"""Collects training shards in the simulator: posed views, and demonstrations of the expert.
+
+    python -m sim.collect kind=views out=outputs/views count=4800 workers=2
+    python -m sim.collect kind=demos out=outputs/demos count=600 workers=2
+
+A part file is a function of the configuration and its index only, so runs may be interrupted, resumed and spread over processes
+without changing a byte. Paper: the planning demonstrations and views that the open stages train on; the paper starts from
+pretrained weights instead.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from configs.schema.collect import CollectConfig
+from configs.validate import ConfigError, build
+from data.shards import Manifest, ShardWriter, config_hash
+
+__all__ = ["collect", "main", "parts_of", "rows_of_part"]
+
+_LOG = logging.getLogger(__name__)
+
+#: Raised when the meaning of a configuration changes, so that old shards are not continued.
+_VERSION = 1
+
+
+def parts_of(config: CollectConfig) -> int:
+    """Number of part files of a configuration."""
+    return -(-config.count // config.part_size)
+
+
+def rows_of_part(config: CollectConfig, part: int) -> list[dict[str, Any]]:
+    """Computes one part; imports the simulator only here, so that workers start light."""
+    if config.kind == "views":
+        from sim.posed_views import views_of_part
+
+        return list(views_of_part(config, part))
+    from sim.demonstrations import demos_of_part
+
+    return list(demos_of_part(config, part))
+
+
+def collect(config: CollectConfig, progress: Callable[[int, int], None] | None = None, overwrite: bool = False) -> Manifest:
+    """Writes a shard folder, continuing one that was interrupted.
+
+    Args:
+        config: what to collect.
+        progress: called with (parts done, parts in all).
+        overwrite: start over when the folder holds shards of another configuration.
+
+    Raises:
+        data.shards.ShardError: when the folder holds something else and `overwrite` is off.
+    """
+    keyed = {k: v for k, v in dataclasses.asdict(config).items() if k not in ("out", "workers")} | {"version": _VERSION}
+    writer = ShardWriter(Path(config.out), config.kind, config_hash(keyed), overwrite)
+    total = parts_of(config)
+    missing = writer.missing(total)
+    done = total - len(missing)
+    report = progress or (lambda finished, parts: _LOG.info("%s: %d of %d parts", config.out, finished, parts))
+    report(done, total)
+    for part, rows in _computed(config, missing):
+        writer.write(part, rows)
+        done += 1
+        report(done, total)
+    return writer.finish({"config": keyed, **_metadata(config)})
+
+
+def _metadata(config: CollectConfig) -> dict[str, Any]:
+    if config.kind != "views":
+        return {}
+    from sim.posed_views import type_names
+
+    return {"type_names": list(type_names())}
+
+
+def _computed(config: CollectConfig, missing: Sequence[int]) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    """Parts as they are finished: in this process, or in spawned ones (the OpenGL context does not survive a fork)."""
+    if config.workers == 1 or len(missing) < 2:
+        for part in missing:
+            yield part, rows_of_part(config, part)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(config.workers, len(missing)), mp_context=context, initializer=_quiet_threads) as pool:
+        futures = {pool.submit(rows_of_part, config, part): part for part in missing}
+        for future in as_completed(futures):
+            yield futures.pop(future), future.result()
+
+
+def _quiet_threads() -> None:
+    """One thread per worker: the workers are the parallelism."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+
+
+def parse(arguments: Sequence[str]) -> CollectConfig:
+    """Reads `key=value` arguments; lists are written `robots=[h1,x1]`.
+
+    Raises:
+        ConfigError: on an argument of another form, an unknown key, or a wrong value.
+    """
+    values: dict[str, Any] = {}
+    for argument in arguments:
+        key, sign, text = argument.partition("=")
+        if not sign:
+            raise ConfigError(
+                f"{argument!r} is not key=value; keys: {', '.join(f.name for f in dataclasses.fields(CollectConfig))}"
+            )
+        values[key] = yaml.safe_load(text)
+    return build(CollectConfig, values)
+
+
+def _with_bar(run: Callable[[Callable[[int, int], None]], Manifest], title: str) -> Manifest:
+    columns = (
+        TextColumn(title),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("parts"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns) as bar:
+        task = bar.add_task(title)
+        return run(lambda done, total: bar.update(task, completed=done, total=total))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    try:
+        config = parse(sys.argv[1:] if arguments is None else arguments)
+    except ConfigError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    manifest = _with_bar(lambda report: collect(config, report), config.kind)
+    facts: Mapping[str, Any] = {"rows": manifest.rows, "parts": len(manifest.parts), "config_hash": manifest.config_hash}
+    sys.stdout.write(f"{config.out}: {facts}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,154 @@
+"""Episodes of the expert on sampled tasks, with exploration noise: the rows of `demos` shards.
+
+With some probability a perturbed step is executed instead of the expert's, while the expert's choice is what is recorded
+(as in DAgger), and some episodes run at medium difficulty; both lead into states that a learned planner will meet and that the
+expert alone would never visit. Episodes that do not end in success are dropped as a whole, so every recorded step led, or could
+have led, to the goal. Paper: planning demonstrations; what the paper takes from pretraining.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from configs.schema.collect import CollectConfig
+from data.records import Action, ActionKind, Observation, PlanStep
+from data.shards import encode_png
+from sim.expert import Expert
+from sim.session import Session
+from sim.tasks.sample import TRAIN_SEEDS, rng_for, sample_task
+from sim.tasks.task import Task
+
+__all__ = ["Episode", "demos_of_part", "perturbed", "run_episode"]
+
+#: Training seeds of one collection seed; two collections do not share tasks.
+_SEEDS_PER_COLLECTION: Final = 1_000_000
+
+
+@dataclass(slots=True)
+class Episode:
+    """What came of one episode.
+
+    Attributes:
+        rows: one per step, ready for a shard.
+        success: whether the goals held at the end.
+        steps: steps taken.
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    success: bool = False
+    steps: int = 0
+
+
+def demos_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
+    """Rows of one part of a `demos` folder; the same for the same configuration, whoever computes it."""
+    first = part * config.part_size
+    sessions: dict[tuple[str, str], Session] = {}
+    for index in range(first, min(first + config.part_size, config.count)):
+        episode = run_episode(config, index, sessions)
+        if episode.success:
+            yield from episode.rows
+
+
+def run_episode(config: CollectConfig, index: int, sessions: dict[tuple[str, str], Session] | None = None) -> Episode:
+    """Plays one episode.
+
+    Args:
+        config: the collection.
+        index: number of the episode; names its task, robot and every draw.
+        sessions: sessions by (robot, difficulty), reused between episodes.
+    """
+    rng = rng_for("demos", config.seed, index)
+    robot = config.robots[index % len(config.robots)]
+    room = config.rooms[(index // len(config.robots)) % len(config.rooms)]
+    task = sample_task(TRAIN_SEEDS.start + config.seed * _SEEDS_PER_COLLECTION + index, room, robots=(robot,))
+    difficulty = "medium" if rng.random() < config.medium_share else "easy"
+    sessions = {} if sessions is None else sessions
+    session = sessions.setdefault((robot, difficulty), Session(robot, difficulty, config.image_size))
+    observation = session.reset(task, seed=task.seed)
+    expert = Expert(session)
+    expert.reset()
+    episode = Episode()
+    while not session.finished:
+        target = expert.next_step()
+        step, origin = target, "expert"
+        if rng.random() < config.noise:
+            step, origin = perturbed(target, observation, rng)
+        episode.rows.append(_row(observation, task, robot, index, target, {"executed": step.to_text(), "origin": origin}))
+        if target.actions[0].name == "Done":
+            break
+        observation, _ = session.step(step)
+    episode.success, episode.steps = session.succeeded, len(episode.rows)
+    return episode
+
+
+def perturbed(step: PlanStep, observation: Observation, rng: np.random.Generator) -> tuple[PlanStep, str]:
+    """A step that goes a little or entirely wrong, and the name of what was done to it."""
+    kinds: list[str] = ["wander", "height"]
+    head = step.actions[0]
+    if head.amount is not None:
+        kinds += ["amount"] * 2
+    if head.spec.kind is ActionKind.ARM:
+        kinds += ["arm"]
+    if len(step.actions) == 2:
+        kinds += ["half"] * 2
+    if observation.known_objects:
+        kinds += ["detour"] * 2
+    kind = str(rng.choice(kinds))
+    return PlanStep((_perturbation(kind, step, observation.known_objects, rng),)), kind
+
+
+def _perturbation(kind: str, step: PlanStep, known: Sequence[str], rng: np.random.Generator) -> Action:
+    head = step.actions[0]
+    if kind == "amount":
+        assert head.amount is not None
+        low, high = head.spec.amount_range
+        unit = 5.0 if head.spec.amount_unit == "deg" else 0.05
+        factor = float(rng.choice((0.4, 0.7, 1.5, 2.0)))
+        amount = float(np.clip(round(factor * head.amount / unit) * unit, max(low, unit), high))
+        return Action(head.name, object_id=head.object_id, amount=round(amount, 2), bearing_deg=head.bearing_deg)
+    if kind == "arm":
+        assert head.arm is not None
+        return Action(head.name, arm=head.arm.other, object_id=head.object_id)
+    if kind == "half":
+        return step.actions[int(rng.integers(2))]
+    if kind == "detour":
+        return Action("GoTo", object_id=str(rng.choice(sorted(known))))
+    if kind == "height":
+        return Action(str(rng.choice(("MoveUp", "MoveDown"))), amount=round(0.05 * float(rng.integers(1, 6)), 2))
+    name = str(rng.choice(("MoveAhead", "MoveBack", "MoveLeft", "MoveRight", "RotateLeft", "RotateRight")))
+    amount = 15.0 * float(rng.integers(1, 7)) if name.startswith("Rotate") else 0.1 * float(rng.integers(1, 6))
+    return Action(name, amount=round(amount, 2))
+
+
+def _row(
+    observation: Observation, task: Task, robot: str, index: int, target: PlanStep, privileged: dict[str, Any]
+) -> dict[str, Any]:
+    body = observation.proprioception
+    return {
+        "episode": f"{task.id}_{robot}_{index}",
+        "task": task.id,
+        "split": task.split,
+        "category": task.category,
+        "robot": robot,
+        "room": task.room,
+        "step": observation.step,
+        "step_budget": observation.step_budget,
+        "instruction": observation.instruction,
+        "image": encode_png(observation.image),
+        "intrinsics": observation.camera.intrinsics.ravel().tolist(),
+        "camera_in_pelvis": observation.camera.camera_in_pelvis.ravel().tolist(),
+        "height": observation.camera.height,
+        "width": observation.camera.width,
+        "motion": body.motion.ravel(),
+        "key_bodies": body.key_bodies_in_pelvis.ravel().tolist(),
+        "visible": list(observation.visible_objects),
+        "known": list(observation.known_objects),
+        "history": [{"step": item.step, "feedback": item.feedback} for item in observation.history],
+        "target": target.to_text(),
+        "privileged": json.dumps(privileged | {"family": task.family}),
+    }
