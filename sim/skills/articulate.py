@@ -60,10 +60,9 @@ class Pull:
     back_m: float
 
 
-def handle_at(body: Body, part: MovingPart, position: float) -> Array:
-    """(3,) world position of a handle at a joint position."""
+def carried_point(body: Body, part: MovingPart, now: Array, position: float) -> Array:
+    """(3,) world position, at another joint position, of a point that is fixed to a door or drawer and is at `now` at present."""
     model, data = body.world.model, body.world.data
-    now = data.site_xpos[part.handle_site]
     axis, change = data.xaxis[part.joint_id], position - float(data.qpos[part.qpos_adr])
     if int(model.jnt_type[part.joint_id]) == 2:  # slide
         return now + change * axis
@@ -95,19 +94,20 @@ def assess_open_close(body: Body, action: Action) -> Pull:
     handle = body.world.data.site_xpos[part.handle_site].copy()
     low, high = part.range
     goal = low + _OPEN_TO * (high - low) if opening else low
+    bar = tuple(map(int, body.part_geoms(thing, "handle")))
+    grip_m = hand_shape(body.spec.name).tip_m - 0.025  # the fingertips reach a little past the bar
     tried = 0
     for pointing in _pointings(body, arm, handle):
-        for closing in (None,):
-            wish = HandPose(handle - 0.02 * pointing, pointing, closing)
-            reach = plan_reach(body, arm, wish, -pointing, 0.09, (thing.object_id,), pointing=0.6)
-            if reach is None:
-                continue
-            tried += 1
-            pull = _plan_pull(body, arm, part, reach, wish.position - handle, goal, opening)
-            if pull is not None:
-                return pull
-            if tried > 6:
-                break
+        wish = HandPose(handle - grip_m * pointing, pointing)
+        reach = plan_reach(body, arm, wish, -pointing, 0.08, bar, pointing=0.7)
+        if reach is None:
+            continue
+        tried += 1
+        pull = _plan_pull(body, arm, part, reach, wish.position, goal, opening)
+        if pull is not None:
+            return pull
+        if tried > 8:
+            break
     failure = out_of_reach(body, arm, handle)
     if failure is not None:
         raise failure
@@ -115,7 +115,7 @@ def assess_open_close(body: Body, action: Action) -> Pull:
 
 
 def _plan_pull(
-    body: Body, arm: Arm, part: MovingPart, reach: Reach, offset: Array, goal: float, opening: bool
+    body: Body, arm: Arm, part: MovingPart, reach: Reach, hand: Array, goal: float, opening: bool
 ) -> Pull | None:
     start = float(body.world.data.qpos[part.qpos_adr])
     positions = np.linspace(start, goal, _WAYPOINTS)
@@ -130,7 +130,7 @@ def _plan_pull(
         postures = [reach.at]
         for share, position in zip(np.linspace(0.0, 1.0, _WAYPOINTS)[1:], positions[1:], strict=True):
             x, y = base.position - back * share * ahead
-            target = HandPose(handle_at(body, part, float(position)) + offset)
+            target = HandPose(carried_point(body, part, hand, float(position)))
             solved = body.solve(arm, target, start=postures[-1], base=Stance(float(x), float(y), base.yaw_rad))
             if solved.error_m > 0.02 or float(np.max(np.abs(solved.q - postures[-1]))) > 0.9:
                 break

@@ -60,21 +60,21 @@ class ClearanceProbe:
             qpos[follower] = np.polyval(coefficients, qpos[leader])
 
     def depths_m(
-        self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str] = (), opening: float | None = None
+        self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str | int] = (), opening: float | None = None
     ) -> Array:
         """Deepest penetration of forearm and hand into furniture or objects for each arm posture, other joints as they are.
 
         Args:
             arm: which one.
             postures: (A,) arm joints each.
-            ignore: ids of objects that may be touched; whatever is held is ignored too.
+            ignore: ids of objects, or numbers of geoms, that may be touched; whatever is held is ignored too.
             opening: opening of the hand, None as it is.
         """
         world, scratch, model = self._world, self._scratch, self._world.model
-        allowed: set[int] = set()
+        allowed = {geom for geom in ignore if isinstance(geom, int)}
         for name, thing in world.objects.items():
             if thing.held_by or name in ignore:
-                allowed.update(thing.body_ids)
+                allowed.update(map(int, thing.geom_ids))
         scratch.qpos[:] = world.data.qpos
         if opening is not None:
             self._shape_hand(arm, opening)
@@ -90,13 +90,13 @@ class ClearanceProbe:
                 if deep <= worst or (int(a) in mine) == (int(b) in mine):
                     continue
                 other = int(b) if int(a) in mine else int(a)
-                if int(model.geom_bodyid[other]) not in allowed:
+                if other not in allowed:
                     worst = float(deep)
             depths.append(worst)
         return np.array(depths)
 
     def free(
-        self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str] = (), opening: float | None = None
+        self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str | int] = (), opening: float | None = None
     ) -> bool:
         """Whether some arm postures at most touch what is around."""
         return bool(np.all(self.depths_m(arm, postures, ignore, opening) <= TOUCH_M))

@@ -77,7 +77,7 @@ def _height_or(body: Body, arm: Arm, point: Array, code: FailureCode) -> SkillFa
     return SkillFailure(code, margins)
 
 
-def stow(body: Body, arm: Arm, ignore: tuple[str, ...] = ()) -> Skill:
+def stow(body: Body, arm: Arm, ignore: tuple[str | int, ...] = ()) -> Skill:
     """Brings the arm to its ready posture, around what is in the way."""
     goal = body.ready(arm)
     way = route(body, arm, body.commanded_arm(arm), goal, ignore)
@@ -97,7 +97,7 @@ def _close(body: Body, arm: Arm, geoms: NDArray[np.int64]) -> Skill:
     yield from wait(0.1)
 
 
-def _retreat(body: Body, arm: Arm, reach: Reach, ignore: tuple[str, ...]) -> Skill:
+def _retreat(body: Body, arm: Arm, reach: Reach, ignore: tuple[str | int, ...]) -> Skill:
     """Opens the hand, backs off along the approach and stows the arm."""
     yield from body.move_hand(arm, 1.0)
     yield from body.move_arm(arm, [reach.before])
@@ -138,7 +138,7 @@ def pick(body: Body, action: Action, luck: Luck) -> Skill:
         raise SkillFailure(FailureCode.DROPPED)
 
 
-def _lift(body: Body, arm: Arm, grasp: Grasp, ignore: tuple[str, ...]) -> Skill:
+def _lift(body: Body, arm: Arm, grasp: Grasp, ignore: tuple[str | int, ...]) -> Skill:
     """Raises the held object straight up, then draws it back towards the body."""
     position, _ = body.hand_pose(arm)
     current = body.commanded_arm(arm)

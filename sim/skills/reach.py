@@ -67,7 +67,7 @@ def out_of_reach(body: Body, arm: Arm, point: Array) -> SkillFailure | None:
 
 
 def route(
-    body: Body, arm: Arm, start: Array, goal: Array, ignore: Iterable[str] = (), opening: float | None = None
+    body: Body, arm: Arm, start: Array, goal: Array, ignore: Iterable[str | int] = (), opening: float | None = None
 ) -> tuple[Array, ...] | None:
     """Postures to pass between two arm postures without a collision: none, or one with the hand drawn in or raised."""
     ignore = tuple(ignore)
@@ -94,7 +94,7 @@ def plan_reach(
     wish: HandPose,
     retreat: Array,
     distance_m: float,
-    ignore: Sequence[str] = (),
+    ignore: Sequence[str | int] = (),
     pointing: float = MIN_POINTING,
     closing: float = MIN_CLOSING,
     opening: float | None = None,
@@ -107,7 +107,7 @@ def plan_reach(
         wish: hand pose at the target, world frame.
         retreat: unit direction from the target back to where the straight line starts.
         distance_m: length of the straight line.
-        ignore: ids of objects that may be touched at the target.
+        ignore: ids of objects, or numbers of geoms, that may be touched at the target.
         pointing, closing: cosines that are demanded.
         opening: opening of the hand on the way, None as it is.
     """
