@@ -192,8 +192,12 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
 
     Raises:
         WeightsError: when the planner's weights are absent.
-        ValueError: when there is no task to run.
+        ValueError: when there is no task to run, or `robot.mjcf` is given.
     """
+    if cfg.robot.mjcf is not None:
+        raise ValueError(
+            f"robot.mjcf={cfg.robot.mjcf!r}: episodes take another MJCF through a description, robot.spec=FILE.yaml"
+        )
     planner, digest = _resolved(cfg.planner)
     jobs = plan_episodes(cfg, select_tasks(cfg), digest)
     folder = run_folder(cfg, digest)

@@ -9,16 +9,18 @@ import dataclasses
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from configs.schema.eval import DifficultyName, PlannerConfig, StartName
 from configs.schema.robot import RobotConfig
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, RunnableSession, run_episode
-from proprio_mllm.evaluation.recording import RolloutRecorder
 from proprio_mllm.planners.protocol import Planner
 from proprio_mllm.planners.registry import make_planner
 from sim.tasks.task import Task
+
+if TYPE_CHECKING:
+    from proprio_mllm.evaluation.recording import RolloutRecorder
 
 __all__ = ["EpisodeJob", "EpisodeResult", "EpisodeWorker", "Opener", "WorkerSetup", "lost_episode"]
 
@@ -100,7 +102,7 @@ class EpisodeWorker:
 
     def __call__(self, job: EpisodeJob) -> EpisodeResult:
         """Runs one episode."""
-        recorder = RolloutRecorder() if job.record else None
+        recorder = _recorder() if job.record else None
         opened: list[RunnableSession] = []
 
         def open_session() -> RunnableSession:
@@ -119,6 +121,12 @@ class EpisodeWorker:
         if recorder is None or record.outcome is Outcome.INFRASTRUCTURE_ERROR:
             return EpisodeResult(record)
         return EpisodeResult(record, recorder.row(job.task, record, opened[-1].relations()))
+
+
+def _recorder() -> RolloutRecorder:
+    from proprio_mllm.evaluation.recording import RolloutRecorder  # training's row format brings torch, which few runs need
+
+    return RolloutRecorder()
 
 
 def lost_episode(job: EpisodeJob, message: str) -> EpisodeResult:

@@ -1,0 +1,147 @@
+"""One episode as a strip of pictures: `python -m proprio_mllm.report.strip RUN TASK [trial=0] [out=FILE.png]`.
+
+The episode is acted out again from its trace, with its own luck, so no planner is needed; a step whose result differs from the
+ledger's is marked. Columns are plan steps: the head view, a view from behind the robot, the plan text and the failure codes.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from configs.schema.eval import EvalConfig
+from configs.validate import build
+from data.records import ActionError, EpisodeRecord, PlanStep
+from proprio_mllm.evaluation.run import select_tasks
+from proprio_mllm.evaluation.seeds import episode_seed
+from proprio_mllm.evaluation.sessions import started
+from proprio_mllm.report.runs import Run, load_run
+from sim.session import Session
+
+__all__ = ["Frame", "draw_strip", "main", "replay"]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The scene after a step: head view, third-person view (each (H, W, 3) uint8), and what to write below."""
+
+    head: NDArray[np.uint8]
+    outside: NDArray[np.uint8]
+    text: str
+    failed: bool
+
+
+def _find(run: Run, task: str, trial: int) -> EpisodeRecord:
+    for record in run.records:
+        if (record.task, record.trial) == (task, trial):
+            return record
+    names = ", ".join(sorted({record.task for record in run.records}))
+    raise ValueError(f"{run.folder}: no episode of task {task!r}, trial {trial}; it has {names}")
+
+
+def replay(run: Run, task: str, trial: int = 0, size: int = 320, camera: str = "behind") -> list[Frame]:
+    """Acts an episode out again.
+
+    Args:
+        run: the run.
+        task: task id.
+        trial: number of the trial.
+        size: side of the pictures, pixels.
+        camera: third-person camera.
+
+    Returns:
+        The start and one frame per step.
+
+    Raises:
+        ValueError: when the run has no such episode.
+    """
+    record = _find(run, task, trial)
+    cfg = build(EvalConfig, run.metadata["config"], "run.json config")
+    found = next(one for one in select_tasks(cfg) if one.id == task)
+    luck = episode_seed(record.seed, task, record.robot, trial)
+    session = Session(cfg.robot.spec or cfg.robot.name, cfg.difficulty, 0)
+    session.reset(started(found, cfg.start, luck), seed=luck)
+
+    def frame(text: str, failed: bool) -> Frame:
+        world = session.world
+        views = [world.render(name, size, size).rgb for name in ("head", camera)]
+        return Frame(views[0], views[1], text, failed)
+
+    frames = [frame(f"start: {found.instruction}", False)]
+    for entry in record.trace:
+        text, outcomes = str(entry["step"]), entry["outcomes"]
+        assert isinstance(outcomes, Sequence)
+        codes = [str(outcome["code"]) for outcome in outcomes]
+        try:
+            step = PlanStep.parse(text)
+        except ActionError:
+            frames.append(frame(f"{text[:60]}\n{codes[0]}", True))
+            continue
+        # Looking around decides what is known, so it is part of acting the episode out.
+        _, feedback = session.step(step)
+        again = [outcome.code for outcome in feedback.outcomes]
+        if again != codes:
+            logger.warning("%s: %s gave %s, the ledger says %s", task, text, again, codes)
+        words = " ".join(code or "ok" for code in again) + ("" if again == codes else " (differs from the ledger)")
+        frames.append(frame(f"{text}\n{words}", any(again)))
+    session.close()
+    return frames
+
+
+def draw_strip(frames: Sequence[Frame], title: str, path: Path, per_row: int = 8) -> Path:
+    """Writes the frames as a picture, `per_row` steps in a line."""
+    lines = -(-len(frames) // per_row)
+    columns = min(per_row, len(frames))
+    figure = Figure(figsize=(2.4 * columns, 5.6 * lines + 0.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(2 * lines, columns, squeeze=False)
+    for axes in grid.ravel():
+        axes.axis("off")
+    for number, frame in enumerate(frames):
+        line, column = divmod(number, per_row)
+        grid[2 * line][column].imshow(frame.head)
+        grid[2 * line][column].set_title(f"{number}", fontsize=8)
+        below = grid[2 * line + 1][column]
+        below.imshow(frame.outside)
+        words = "\n".join(textwrap.fill(part, 32) for part in frame.text.splitlines())
+        below.text(0.5, -0.03, words, transform=below.transAxes, ha="center", va="top", fontsize=7,
+                   color="#aa3377" if frame.failed else "black")  # fmt: skip
+    figure.suptitle(title, fontsize=10)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+    return path
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Command line; 0 on success, 2 on wrong arguments."""
+    options = dict(part.split("=", 1) for part in arguments[2:] if "=" in part)
+    if len(arguments) < 2 or len(options) != len(arguments) - 2 or set(options) - {"trial", "out", "camera"}:
+        sys.stderr.write("usage: python -m proprio_mllm.report.strip RUN TASK [trial=0] [camera=behind] [out=FILE.png]\n")
+        return 2
+    folder, task = Path(arguments[0]), arguments[1]
+    try:
+        run, trial = load_run(folder), int(options.get("trial", "0"))
+        record = _find(run, task, trial)
+        frames = replay(run, task, trial, camera=options.get("camera", "behind"))
+    except ValueError as error:
+        sys.stderr.write(f"strip: {error}\n")
+        return 2
+    title = f"{run.metadata['label']} · {record.robot} · {task} · {record.outcome.value}"
+    out = Path(options.get("out", str(folder / f"strip-{task}-{trial}.png")))
+    sys.stdout.write(f"{draw_strip(frames, title, out)}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

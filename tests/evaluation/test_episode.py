@@ -1,0 +1,98 @@
+"""The episode loop: ends, budgets, invalid replies, and errors that are no scores."""
+
+from __future__ import annotations
+
+import pytest
+
+from data.records import FailureCategory, Outcome
+from proprio_mllm.evaluation.episode import run_episode
+
+SOLVED = ("GoTo(Mug_1)", "MoveDown(0.2)", "Pick(left, Mug_1)")
+
+
+def play(session, planner, fields, budget=6, **kwargs):
+    return run_episode(lambda: session, planner, fields, "pick up the mug", budget, 5, **kwargs)
+
+
+def test_success_ends_the_episode_and_is_counted(session, scripted, fields) -> None:
+    planner = scripted(*SOLVED, "MoveAhead()")
+    record = play(session(), planner, fields)
+    assert record.outcome is Outcome.SUCCESS
+    assert record.failure is None
+    assert (record.steps, record.planner_calls, record.planner_tokens, record.invalid_output) == (3, 3, 30, 0)
+    assert (record.path_length_m, record.makespan_s, record.arm_utilisation) == (3.0, 4.5, 0.25)
+    assert record.goal_conditions_met == 1.0
+    assert not record.budget_exhausted
+    assert [step["step"] for step in record.trace] == list(SOLVED)
+
+
+def test_the_runner_owns_history_step_and_budget(session, scripted, fields) -> None:
+    planner = scripted("GoTo(Mug_1)", "gibberish", "Pick(left, Mug_1)", "MoveDown(0.2)")
+    play(session(), planner, fields, budget=5)
+    assert [o.step for o in planner.seen] == [0, 1, 2, 3, 4]
+    assert {o.step_budget for o in planner.seen} == {5}
+    assert [item.feedback for item in planner.seen[4].history] == [
+        "GoTo(Mug_1) ok",
+        "gibberish InvalidOutput",
+        "Pick(left, Mug_1) BodyTooHigh",
+        "MoveDown(0.2) ok",
+    ]
+    assert planner.heard[0] is None
+    assert planner.heard[2] is None  # after the invalid reply
+    assert planner.heard[3] is not None
+
+
+def test_margins_stay_in_the_trace(session, scripted, fields) -> None:
+    planner = scripted("Pick(left, Mug_1)")
+    record = play(session(), planner, fields)
+    assert record.trace[0]["outcomes"][0]["margins"] == {"reach_m": 0.4}
+    assert "0.4" not in " ".join(item.feedback for item in planner.seen[1].history)
+
+
+def test_budget_and_category(session, scripted, fields) -> None:
+    record = play(session(), scripted(*["Pick(left, Mug_1)"] * 9), fields, budget=4)
+    assert record.outcome is Outcome.FAILURE
+    assert record.failure is FailureCategory.NAVIGATION
+    assert record.budget_exhausted
+    assert record.steps == 4
+
+
+def test_done_too_early_is_logical_and_not_exhausted(session, scripted, fields) -> None:
+    record = play(session(), scripted("GoTo(Mug_1)"), fields)
+    assert record.failure is FailureCategory.LOGICAL
+    assert not record.budget_exhausted
+
+
+@pytest.mark.parametrize(
+    "text", ["", "Fly(Mug_1)", "Pick(Mug_1)", "\x00\x00", "Pick(left, Mug_1) & GoTo(Mug_1)", "MoveDown(nan)"]
+)
+def test_invalid_replies_never_crash(session, scripted, fields, text) -> None:
+    record = play(session(), scripted(*[text] * 9), fields, budget=3)
+    assert record.outcome is Outcome.FAILURE
+    assert record.failure is FailureCategory.LOGICAL
+    assert (record.invalid_output, record.steps) == (3, 3)
+
+
+def test_errors_are_recorded_not_scored(session, scripted, fields) -> None:
+    record = play(session(broken=2), scripted(*SOLVED), fields)
+    assert record.outcome is Outcome.INFRASTRUCTURE_ERROR
+    assert record.failure is None
+    assert "the physics exploded" in record.message
+    assert record.steps == 1
+
+
+def test_an_error_while_opening_is_recorded_too(scripted, fields) -> None:
+    def broken():
+        raise OSError("no display")
+
+    record = run_episode(broken, scripted(), fields, "x", 3, 0)
+    assert record.outcome is Outcome.INFRASTRUCTURE_ERROR
+    assert "no display" in record.message
+
+
+def test_watcher_sees_every_observation_and_the_end(session, scripted, fields) -> None:
+    seen = []
+    play(session(), scripted(*SOLVED), fields, watch=lambda o, reply, feedback: seen.append((o.step, reply, feedback)))
+    assert [step for step, _, _ in seen] == [0, 1, 2, 3]
+    assert seen[0][1] is None
+    assert seen[3][1].text == SOLVED[2]

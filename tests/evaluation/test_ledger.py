@@ -1,0 +1,69 @@
+"""The ledger: round trip, cut lines, unknown versions, what counts as done."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+
+from data.records import FailureCategory, Outcome
+from proprio_mllm.evaluation.episode import run_episode
+from proprio_mllm.evaluation.ledger import Ledger, LedgerError, key_of, read_ledger, scored
+from proprio_mllm.evaluation.seeds import episode_seed, stream
+
+
+@pytest.fixture
+def record(session, scripted, fields):
+    return run_episode(session, scripted("Pick(left, Mug_1)", "ünlesbar"), fields, "pick up the mug", 4, 1)
+
+
+def test_round_trip(tmp_path, record) -> None:
+    path = tmp_path / "deep" / "ledger.jsonl"
+    with Ledger(path) as ledger:
+        ledger.append(record)
+    assert read_ledger(path) == [record]
+    assert record.failure is FailureCategory.NAVIGATION
+
+
+def test_no_file_is_no_record(tmp_path) -> None:
+    assert read_ledger(tmp_path / "none.jsonl") == []
+
+
+def test_a_cut_line_is_dropped_and_overwritten(tmp_path, record) -> None:
+    path = tmp_path / "ledger.jsonl"
+    with Ledger(path) as ledger:
+        ledger.append(record)
+    whole = path.read_bytes()
+    path.write_bytes(whole + whole[:37])
+    assert read_ledger(path) == [record]
+    with Ledger(path) as ledger:
+        ledger.append(record)
+    assert path.read_bytes() == whole * 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"), [({"version": 9}, "version 9"), ({"steps2": 1}, "steps2"), ({"outcome": "won"}, "won")]
+)
+def test_refuses_what_it_does_not_know(tmp_path, record, change, message) -> None:
+    path = tmp_path / "ledger.jsonl"
+    with Ledger(path) as ledger:
+        ledger.append(record)
+    path.write_text(json.dumps(json.loads(path.read_text()) | change) + "\n")
+    with pytest.raises(LedgerError, match=f"line 1.*{message}"):
+        read_ledger(path)
+
+
+def test_first_score_counts_and_errors_never_do(record) -> None:
+    broken = dataclasses.replace(record, outcome=Outcome.INFRASTRUCTURE_ERROR, failure=None)
+    other = dataclasses.replace(record, steps=99)
+    assert scored([broken]) == {}
+    assert scored([broken, record, other]) == {key_of(record): record}
+
+
+def test_seeds_are_stable_and_differ() -> None:
+    assert episode_seed(0, "a", "h1", 0) == 976892428  # ledgers of earlier versions stay valid
+    keys = [(s, t, r, k) for s in (0, 1) for t in "ab" for r in ("h1", "x1") for k in (0, 1)]
+    assert len({episode_seed(*key) for key in keys}) == len(keys)
+    assert stream(3, "planner").integers(2**31) == stream(3, "planner").integers(2**31)
+    assert stream(3, "planner").integers(2**31) != stream(3, "start").integers(2**31)

@@ -1,0 +1,139 @@
+"""Planning, running, resuming: equal commands give equal tables, however often they were interrupted."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.robot import RobotConfig
+from data.records import Outcome
+from proprio_mllm.evaluation.ledger import read_ledger
+from proprio_mllm.evaluation.run import evaluate, plan_episodes, run_folder, select_tasks, weights_digest
+from proprio_mllm.planners.protocol import WeightsError
+from proprio_mllm.report.runs import load_run, write_report
+from sim.tasks.task import write_tasks
+
+SCRIPT = Path(__file__).parent / "interrupted.py"
+
+
+@pytest.fixture
+def cfg(tmp_path, task) -> EvalConfig:
+    path = tmp_path / "tasks.jsonl"
+    write_tasks([task(f"t{i}", category) for i, category in enumerate(("single", "single", "optional", "essential"))], path)
+    return EvalConfig(
+        planner=PlannerConfig("random", "random", "Random", image_size=28),
+        robot=RobotConfig("h1"),
+        workers=0,
+        tasks=str(path),
+        output=str(tmp_path / "out"),
+    )
+
+
+def test_runs_every_task_once_and_continues(cfg, session) -> None:
+    opened = []
+
+    def opener(setup, job, planner):
+        opened.append(job.fields.task)
+        return session()
+
+    first = evaluate(cfg, opener)
+    assert sorted(opened) == ["t0", "t1", "t2", "t3"]
+    assert [record.task for record in first.records] == ["t0", "t1", "t2", "t3"]
+    again = evaluate(cfg, opener)
+    assert len(opened) == 4
+    assert again.records == first.records
+    more = evaluate(dataclasses.replace(cfg, limit=1), opener)
+    assert [record.task for record in more.records] == ["t0", "t2", "t3"]
+    assert more.folder != first.folder
+
+
+def test_errors_are_rerun_never_scored(cfg, session) -> None:
+    broken = {"t1": 1, "t2": 9}
+
+    def opener(setup, job, planner):
+        left = broken.get(job.fields.task, 0)
+        broken[job.fields.task] = left - 1
+        return session(broken=1 if left > 0 else None)
+
+    run = evaluate(cfg, opener)  # one retry: t1 recovers, t2 does not
+    assert [record.task for record in run.records] == ["t0", "t1", "t3"]
+    assert [record.task for record in run.broken] == ["t1", "t2", "t2"]
+    assert all(record.outcome is not Outcome.INFRASTRUCTURE_ERROR for record in run.records)
+    table = write_report(load_run(run.folder))
+    assert "1 of 4 episodes have no score" in " ".join(table.notes)
+    summary = json.loads((run.folder / "summary.json").read_text())
+    assert (summary["complete"], summary["infrastructure_errors"]) == (False, 3)
+    broken["t2"] = 0
+    assert len(evaluate(cfg, opener).records) == 4
+
+
+def test_other_settings_are_other_episodes(cfg) -> None:
+    tasks = select_tasks(cfg)
+    jobs = plan_episodes(dataclasses.replace(cfg, trials=2), tasks, "w")
+    assert len({(job.fields.task, job.fields.trial) for job in jobs}) == 8
+    assert len({job.luck for job in jobs}) == 8
+    assert plan_episodes(cfg, tasks, "w")[0].fields != plan_episodes(cfg, tasks, "v")[0].fields
+    turned = dataclasses.replace(cfg, start="turned")
+    assert run_folder(turned, "w") != run_folder(cfg, "w")
+    # The planner is not part of the luck.
+    other = dataclasses.replace(cfg, planner=dataclasses.replace(cfg.planner, name="other"))
+    assert plan_episodes(other, tasks, "w")[0].luck == plan_episodes(cfg, tasks, "w")[0].luck
+
+
+def test_selection_refuses_what_is_not_there(cfg) -> None:
+    with pytest.raises(ValueError, match=r"nowhere\.jsonl"):
+        select_tasks(dataclasses.replace(cfg, tasks="nowhere.jsonl"))
+    only = dataclasses.replace(cfg, category="essential")
+    assert [task.id for task in select_tasks(only)] == ["t3"]
+    path = Path(cfg.tasks)
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:2]))
+    with pytest.raises(ValueError, match="no task of category 'essential'"):
+        select_tasks(only)
+
+
+def test_absent_weights_name_path_and_command(cfg, tmp_path) -> None:
+    planner = PlannerConfig("proprio", "mllm", "P", str(tmp_path / "gone"), train="python train.py stage=all")
+    with pytest.raises(WeightsError, match=r"gone.*python train\.py stage=all"):
+        evaluate(dataclasses.replace(cfg, planner=planner))
+
+
+def test_digest_changes_with_the_files(tmp_path) -> None:
+    (tmp_path / "config.json").write_text("{}")
+    before = weights_digest(tmp_path)
+    (tmp_path / "notes.md").write_text("x")
+    assert weights_digest(tmp_path) == before
+    (tmp_path / "config.json").write_text("{} ")
+    assert weights_digest(tmp_path) != before
+
+
+def test_killed_and_resumed_gives_the_same_table(tmp_path) -> None:
+    def start(output: Path) -> subprocess.Popen:
+        return subprocess.Popen([sys.executable, str(SCRIPT), str(output)], cwd=SCRIPT.parents[2], stderr=subprocess.DEVNULL)
+
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    uninterrupted, process = start(whole), start(cut)
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and process.poll() is None:
+        found = list(cut.glob("eval/*/ledger.jsonl"))
+        if found and found[0].read_bytes().count(b"\n") >= 5:
+            break
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    (ledger,) = cut.glob("eval/*/ledger.jsonl")
+    before = len(read_ledger(ledger))
+    assert 5 <= before < 24
+    assert start(cut).wait(60) == 0
+    assert uninterrupted.wait(60) == 0
+    (other,) = whole.glob("eval/*/ledger.jsonl")
+    assert len(read_ledger(ledger)) == len(read_ledger(other)) == 24
+    for name in ("table.md", "table.csv"):
+        assert (ledger.parent / name).read_text() == (other.parent / name).read_text()

@@ -1,0 +1,75 @@
+"""Intervals against closed forms and scipy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from proprio_mllm.report.statistics import cluster_bootstrap, compare, rate_interval, wilson
+
+
+@pytest.mark.parametrize(("k", "n"), [(0, 12), (1, 12), (7, 12), (12, 12), (84, 133), (1, 1), (60, 60)])
+@pytest.mark.parametrize("confidence", [0.9, 0.95])
+def test_wilson_equals_scipy(k: int, n: int, confidence: float) -> None:
+    expected = stats.binomtest(k, n).proportion_ci(confidence, method="wilson")
+    assert wilson(k, n, confidence) == pytest.approx((expected.low, expected.high), abs=1e-12)
+
+
+def test_wilson_of_the_papers_cell() -> None:
+    assert [round(100 * limit, 1) for limit in wilson(84, 133)] == [54.7, 70.9]
+
+
+@pytest.mark.parametrize(("k", "n", "confidence"), [(1, 0, 0.95), (-1, 3, 0.95), (4, 3, 0.95), (1, 3, 1.0)])
+def test_wilson_refuses(k: int, n: int, confidence: float) -> None:
+    with pytest.raises(ValueError, match=str(confidence) if confidence == 1.0 else f"{k} of {n}"):
+        wilson(k, n, confidence)
+
+
+def test_agreeing_trials_count_once() -> None:
+    many = {f"t{i}": [i < 3] * 50 for i in range(10)}
+    interval = rate_interval(many)
+    assert interval.method == "wilson"
+    assert (interval.low, interval.high) == wilson(3, 10)
+    assert interval.rate == pytest.approx(0.3)
+
+
+def test_disagreeing_trials_bootstrap_over_tasks() -> None:
+    rng = np.random.default_rng(0)
+    rates = rng.uniform(size=40)
+    tasks = {f"t{i:02d}": list(rng.random(50) < rate) for i, rate in enumerate(rates)}
+    interval = rate_interval(tasks)
+    means = np.array([np.mean(values) for values in tasks.values()])
+    # With clusters of one size the bootstrap's spread is the standard error of the cluster means.
+    half = 1.96 * means.std() / math.sqrt(len(means))
+    assert interval.method == "bootstrap"
+    assert interval.rate == pytest.approx(means.mean())
+    assert (interval.high - interval.low) / 2 == pytest.approx(half, rel=0.08)
+    assert rate_interval(tasks) == interval
+
+
+def test_no_episode_is_no_number() -> None:
+    interval = rate_interval({})
+    assert interval.method == "none"
+    assert math.isnan(interval.rate)
+
+
+def test_bootstrap_of_constant_clusters_is_a_point() -> None:
+    assert cluster_bootstrap([[1.0], [1.0, 1.0]], np.random.default_rng(0)) == (1.0, 1.0)
+    with pytest.raises(ValueError, match=r"\[1, 0\]"):
+        cluster_bootstrap([[1.0], []], np.random.default_rng(0))
+
+
+def test_paired_comparison() -> None:
+    a = {f"t{i}": [i < 9] for i in range(12)}
+    b = {f"t{i}": [i < 2] for i in range(12)} | {"other": [True]}
+    result = compare(a, b)
+    assert result.tasks == 12
+    assert result.difference == pytest.approx(7 / 12)
+    assert result.p_value == pytest.approx(2 * 0.5**7)
+    assert 0 < result.low < result.difference < result.high <= 1
+    assert compare(a, a).p_value == 1.0
+    with pytest.raises(ValueError, match="no common task"):
+        compare(a, {"x": [True]})

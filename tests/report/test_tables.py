@@ -1,0 +1,143 @@
+"""Summaries, tables and experiments from ledgers."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import pytest
+import yaml
+from rich.console import Console
+
+from configs.schema.eval import ExperimentConfig
+from data.records import FailureCategory, Outcome
+from proprio_mllm.report import paper
+from proprio_mllm.report.experiments import EXPERIMENTS, ablation_table, assemble, main_table, replanning_table
+from proprio_mllm.report.runs import find_runs, load_run, write_report
+from proprio_mllm.report.statistics import wilson
+from proprio_mllm.report.summary import rows_of
+from proprio_mllm.report.table import Table, rate_cell, run_table
+
+
+def test_rows_count_and_add_up(record) -> None:
+    records = [
+        record("a", "single", True),
+        record("b", "single", False, failure=FailureCategory.BODY_ADJUSTMENT),
+        record("c", "essential", False, failure=FailureCategory.LOGICAL),
+        record("d", "essential", False, outcome=Outcome.INFRASTRUCTURE_ERROR, failure=None),
+    ]
+    single, optional, essential, everything = rows_of(records)
+    assert (single.successes, single.episodes, single.body_adjustment) == (1, 2, 1)
+    assert (single.low, single.high) == wilson(1, 2)
+    assert optional.episodes == 0
+    assert optional.to_json()["success_rate"] is None
+    assert (essential.episodes, essential.logical) == (1, 1)
+    assert everything.category == "all"
+    assert everything.navigation + everything.body_adjustment + everything.logical == everything.episodes - everything.successes
+    assert everything.invalid_rate == pytest.approx(3 / 15)
+    assert everything.calls == 5.0
+
+
+def test_report_files_agree_and_end_with_all(tmp_path, run) -> None:
+    folder = run(tmp_path)
+    table = write_report(load_run(folder))
+    assert [row[0] for row in table.rows] == ["single", "optional", "essential", "all"]
+    summary = json.loads((folder / "summary.json").read_text())
+    rows = list(csv.reader(io.StringIO((folder / "table.csv").read_text())))
+    for row, cells in zip(summary["rows"], rows[1:], strict=True):
+        assert cells[1] == f"{row['successes']}/{row['episodes']}"
+        assert row["navigation"] + row["body_adjustment"] + row["logical"] == row["episodes"] - row["successes"]
+    assert summary["complete"]
+    assert summary["provenance"]["command"].startswith("python eval.py")
+    markdown = (folder / "table.md").read_text().splitlines()
+    assert markdown[-1].startswith("| all")
+    buffer = io.StringIO()
+    table.show(Console(file=buffer, width=140))
+    assert buffer.getvalue().rstrip().splitlines()[-1].lstrip().startswith("all")
+
+
+def test_privileged_runs_say_so(tmp_path, run) -> None:
+    assert any("Privileged" in note for note in write_report(load_run(run(tmp_path, "expert"))).notes)
+
+
+def test_cell_layout(record) -> None:
+    rows = rows_of([record(f"t{i}", "essential", i < 84) for i in range(133)])
+    assert rate_cell(rows[2]) == "63.2 [54.7, 70.9] 84/133"
+    assert rate_cell(rows[0]) == ""
+    assert run_table("t", rows).rows[2][:4] == ("essential", "84/133", "63.2", "[54.7, 70.9]")
+
+
+def test_tables_refuse_ragged_rows() -> None:
+    with pytest.raises(ValueError, match="2 cells, expected 1"):
+        Table("t", ("a",), (("x", "y"),))
+
+
+def test_load_refuses_what_is_no_run(tmp_path, run) -> None:
+    with pytest.raises(ValueError, match=r"run\.json is missing"):
+        load_run(tmp_path)
+    folder = run(tmp_path)
+    meta = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(meta | {"version": 7}))
+    with pytest.raises(ValueError, match="version 7"):
+        load_run(folder)
+
+
+def test_papers_figures_are_the_files_and_consistent() -> None:
+    main = paper.paper_main()
+    assert main["Proprio-MLLM"]["essential", "h1"] == 63.16
+    assert main["Qwen2.5-VL-7B-Ins"]["single", "x1"] == 23.33
+    assert paper.paper_replanning()["DAG-Plan"]["hard"] == 15.53
+    for values in paper.paper_ablation().values():  # failures add up to (1 - success) of 133 tasks x 50 trials
+        failures = values["navigation"] + values["body_adjustment"] + values["logical"]
+        assert failures == pytest.approx((1 - values["success_percent"] / 100) * 133 * 50, abs=30)
+    for names in paper.PAPER_ROWS.values():
+        tables = (paper.paper_main(), paper.paper_replanning(), paper.paper_ablation())
+        assert all(name is None or name in table for name, table in zip(names, tables, strict=True))
+
+
+def test_main_table_keeps_ours_and_the_papers_apart(tmp_path, run) -> None:
+    run(tmp_path, "random", "h1")
+    cfg = ExperimentConfig("main_table", ("random", "proprio"))
+    table = main_table(cfg, find_runs(tmp_path))
+    sources = [row[1] for row in table.rows]
+    assert sources == ["ours", "ours"] + ["paper"] * 8
+    column = table.columns.index("essential h1")
+    assert "/4" in table.rows[0][column]
+    assert table.rows[0][table.columns.index("essential x1")] == ""  # not run
+    assert set(table.rows[1][2:]) == {""}
+    assert next(row for row in table.rows if row[0] == "Proprio-MLLM")[column] == "63.16"
+
+
+def test_ablation_and_replanning(tmp_path, run) -> None:
+    run(tmp_path, "proprio", "h1", "easy")
+    run(tmp_path, "proprio", "h1", "hard", seed=1)
+    runs = find_runs(tmp_path)
+    ablation = ablation_table(ExperimentConfig("ablation_table", ("proprio", "proprio_no_cse"), ("h1",)), runs)
+    assert ablation.rows[0][1] != ""
+    assert ablation.rows[1][1:5] == ("", "", "", "")
+    assert ablation.rows[1][5:] == ("45.17", "2205", "902", "538")
+    again = replanning_table(ExperimentConfig("replanning_table", ("proprio",), ("h1",), ("easy", "medium", "hard")), runs)
+    assert again.rows[0][2] != ""
+    assert again.rows[0][3] == ""
+    assert again.rows[0][4] != ""
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_is_assembled_with_and_without_runs(tmp_path, run, name, monkeypatch) -> None:
+    from proprio_mllm.report import figures
+
+    monkeypatch.setattr(figures, "load_benchmark", tuple)
+    cfg = ExperimentConfig(name, ("random", "expert"))
+    for _ in range(2):
+        _, files = assemble(cfg, tmp_path)
+        assert files
+        assert all(path.stat().st_size > 100 for path in files)
+        run(tmp_path)
+
+
+def test_copy_of_the_papers_tables_is_whole() -> None:
+    from pathlib import Path
+
+    raw = yaml.safe_load((Path(paper.__file__).parent / "paper_tables.yaml").read_text())
+    assert raw["protocol"]["tasks"] == raw["protocol"]["essential"] + raw["protocol"]["optional"] + raw["protocol"]["single"]
