@@ -1,15 +1,17 @@
 """Trains Proprio-MLLM: `python train.py stage=all model=tiny` (paper, three stages; `stage=base` stands in for pretraining).
 
-Stages: data (motions to clips shards), collect (views and demonstrations), base, pointmap, tokenizer, alignment, selu; `all` runs
-them in order and skips what is current. Options are documented in configs/schema/train.py.
+Stages: data (motions to clips shards), collect (views and demonstrations), base, pointmap, tokenizer, alignment, selu; `all`
+runs them in order and skips what is current. Options are documented in configs/schema/train.py.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from configs.compose import compose
@@ -23,11 +25,13 @@ TRAINING_STAGES = ("base", "pointmap", "tokenizer", "alignment", "selu")
 
 def make_data(cfg: TrainConfig) -> None:
     """Motions: generate or load, retarget to both robots, filter, replay with head-camera frames, write `clips` shards."""
-    from data.pipeline import prepare_clips
+    from data.pipeline import build_clips
     from proprio_mllm.training.paths import StagePaths
     from sim.replay import replay_clip
 
-    prepare_clips(cfg.data, StagePaths(cfg).shards("clips"), replay_clip, workers=cfg.collect.workers, seed=cfg.seed)
+    size = dataclasses.replace(cfg.data.replay, image_size=cfg.model.image_size)
+    motions = dataclasses.replace(cfg.data, seed=cfg.seed, replay=size)
+    build_clips(motions, StagePaths(cfg).shards("clips"), replay_clip, _progress("clips"), overwrite=cfg.overwrite)
 
 
 def make_shards(cfg: TrainConfig) -> None:
@@ -42,7 +46,21 @@ def make_shards(cfg: TrainConfig) -> None:
             kind=kind, out=str(out), count=count, seed=cfg.seed, image_size=cfg.model.image_size, part_size=part,
             workers=cfg.collect.workers,
         )  # fmt: skip
-        collect(shards, overwrite=cfg.overwrite)
+        collect(shards, overwrite=cfg.overwrite, progress=_progress(kind))
+
+
+def _progress(name: str) -> Callable[[int, int], None]:
+    """Reports finished parts with an estimate of the time left."""
+    began = time.monotonic()
+    first: list[int] = []
+
+    def report(done: int, total: int) -> None:
+        first.append(done)
+        fresh = done - first[0]
+        left = (time.monotonic() - began) / fresh * (total - done) / 60.0 if fresh else float("nan")
+        logger.info("%s: %d of %d parts%s", name, done, total, f", {left:.1f} min left" if fresh else "")
+
+    return report
 
 
 def run(cfg: TrainConfig) -> dict[str, Any]:

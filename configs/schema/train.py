@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from configs.schema.data import DataConfig
 from configs.schema.model import ModelConfig
 
 __all__ = [
@@ -41,6 +42,9 @@ class LoopConfig:
         clip: largest gradient norm.
         checkpoint_every: steps between checkpoints.
         log_every: steps between log lines.
+        minutes: time budget over all resumed parts; the schedule then follows whichever of steps and time is further, so
+            results depend on the machine's speed. 0 means steps alone count.
+        precision: `bf16` computes under autocast, parameters stay as they are.
     """
 
     steps: int
@@ -51,11 +55,14 @@ class LoopConfig:
     clip: float = 1.0
     checkpoint_every: int = 200
     log_every: int = 20
+    minutes: float = 0.0
+    precision: Literal["fp32", "bf16"] = "fp32"
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "checkpoint_every", "log_every"):
             _require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
         _require(self.lr > 0.0, f"lr {self.lr} must be positive")
+        _require(self.minutes >= 0.0, f"minutes {self.minutes} must not be negative")
 
 
 @dataclass(frozen=True)
@@ -139,13 +146,11 @@ class CollectConfig:
     Attributes:
         views: posed views.
         episodes: expert episodes.
-        clips: generated motion clips before filtering.
         workers: processes.
     """
 
     views: int = 6000
     episodes: int = 500
-    clips: int = 300
     workers: int = 2
 
 
@@ -175,7 +180,8 @@ class TrainConfig:
         threads: torch threads; 0 leaves torch's choice.
         overwrite: run a stage again although its output is current.
         release: folder the finished stages are exported to, None for no export.
-        data: where motions come from.
+        resume: continue an interrupted stage from its checkpoint.
+        data: where motions come from, and what is kept of them.
     """
 
     stage: StageName
@@ -186,6 +192,7 @@ class TrainConfig:
     tokenizer: LoopConfig
     alignment: AlignmentConfig
     selu: SeluConfig
+    data: DataConfig = field(default_factory=DataConfig)
     collect: CollectConfig = field(default_factory=CollectConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     output: str = "outputs"

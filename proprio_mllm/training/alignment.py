@@ -8,8 +8,8 @@
 
 "Freeze the image and text weights separately" leaves open which weights; this reading freezes one modality's while the other's
 pairs train. Besides clip captions, motion and image to text holds questions about the robot's own body in its scene (which arm
-reaches an object, how far the body must go down). A share of planning demonstrations, with motion tokens in the prompt, keeps the
-planner's format; the paper does not mention any such replay.
+reaches an object, how far the body must go down). A share of planning demonstrations, with motion tokens in the prompt, keeps
+the planner's format; the paper does not mention any such replay.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Three parts, each needed (a small model trained on questions alone never binds words to image regions): dense, name-tied
 pretraining of the vision tower on the simulator's truth; grounding questions packed per image and image-to-text listing;
-planning demonstrations without proprioception, with judging questions about the expert's logs among them. Its result is also the table row "Qwen2.5-VL-Ins" at this size. The paper has no
-such stage.
+planning demonstrations without proprioception, with judging questions about the expert's logs among them. Its result is also
+the table row "Qwen2.5-VL-Ins" at this size. The paper has no such stage.
 """
 
 from __future__ import annotations

@@ -18,7 +18,9 @@ from torch import Tensor, nn
 __all__ = ["load_checkpoint", "save_checkpoint"]
 
 
-def save_checkpoint(folder: Path, step: int, module: nn.Module, optimizer: torch.optim.Optimizer, key: str) -> None:
+def save_checkpoint(
+    folder: Path, step: int, module: nn.Module, optimizer: torch.optim.Optimizer, key: str, seconds: float = 0.0
+) -> None:
     """Writes a checkpoint atomically.
 
     Args:
@@ -26,16 +28,18 @@ def save_checkpoint(folder: Path, step: int, module: nn.Module, optimizer: torch
         step: steps taken.
         module: its trainable parameters and all buffers are stored.
         optimizer: AdamW over those parameters.
-        key: identifies the run; loading with another key is refused.
+        key: identifies the run; a checkpoint of another key is not loaded.
+        seconds: time spent so far.
     """
     work = folder.with_name(folder.name + ".tmp")
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     save_file(_trained(module), work / "model.safetensors")
     state = optimizer.state_dict()["state"]
-    flat = {f"{index}.{name}": torch.as_tensor(value).contiguous() for index, entry in state.items() for name, value in entry.items()}
+    entries = [(f"{index}.{name}", value) for index, entry in state.items() for name, value in entry.items()]
+    flat = {name: torch.as_tensor(value).contiguous() for name, value in entries}
     save_file(flat, work / "optimizer.safetensors")
-    (work / "state.json").write_text(json.dumps({"step": step, "key": key}), encoding="utf-8")
+    (work / "state.json").write_text(json.dumps({"step": step, "key": key, "seconds": seconds}), encoding="utf-8")
     old = folder.with_name(folder.name + ".old")
     shutil.rmtree(old, ignore_errors=True)
     if folder.exists():
@@ -44,15 +48,19 @@ def save_checkpoint(folder: Path, step: int, module: nn.Module, optimizer: torch
     shutil.rmtree(old, ignore_errors=True)
 
 
-def load_checkpoint(folder: Path, module: nn.Module, optimizer: torch.optim.Optimizer, key: str) -> int:
-    """Restores a checkpoint and returns its step; 0 when there is none, or it belongs to another run."""
+def load_checkpoint(folder: Path, module: nn.Module, optimizer: torch.optim.Optimizer, key: str) -> tuple[int, float]:
+    """Restores a checkpoint and returns its step and seconds spent; zeros when there is none, or it is of another run.
+
+    Raises:
+        ValueError: when the checkpoint holds other tensors than the module trains.
+    """
     if not (folder / "state.json").is_file():
         folder = folder.with_name(folder.name + ".old")
     if not (folder / "state.json").is_file():
-        return 0
+        return 0, 0.0
     state: dict[str, Any] = json.loads((folder / "state.json").read_text(encoding="utf-8"))
     if state["key"] != key:
-        return 0
+        return 0, 0.0
     tensors = load_file(folder / "model.safetensors")
     own = _trained(module)
     if set(own) != set(tensors):
@@ -65,7 +73,7 @@ def load_checkpoint(folder: Path, module: nn.Module, optimizer: torch.optim.Opti
         index, _, field = name.partition(".")
         entries.setdefault(int(index), {})[field] = tensor
     optimizer.load_state_dict({"state": entries, "param_groups": optimizer.state_dict()["param_groups"]})
-    return int(state["step"])
+    return int(state["step"]), float(state["seconds"])
 
 
 def _trained(module: nn.Module) -> dict[str, Tensor]:

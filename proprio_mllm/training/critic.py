@@ -7,8 +7,9 @@ open are ours: judging every moment to cut a trajectory at its first success, dr
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -176,7 +177,7 @@ def critic_examples(
             add("direct", t, rollout.instruction, "yes")
             continue
         add("negative", t, rollout.instruction, "no")
-        ask: Callable[[str], str] = lambda relation, t=t: judge.ask(t, relation)
+        ask = functools.partial(judge.ask, t)
         found = relabel(rollout.instruction, rollout.moments[-1].known, rollout.receptacles(), ask, (rollout.instruction,))
         if found is None:
             continue
@@ -245,7 +246,9 @@ def actor_examples(kept: Sequence[Kept], style: Literal["terse", "full"], last: 
 
 
 def audit(trajectories: Sequence[Trajectory], goals: Mapping[tuple[str, str], Relabel], judge: Judge) -> dict[str, float]:
-    """The judge against the simulator's truth at the end: precision, recall and counts, for reports only."""
+    """The judge against the simulator's truth at the end, for reports only: counts, and what they define of accuracy,
+    precision and recall.
+    """
     oracle = OracleJudge(goals)
     by_episode = {t.rollout.episode: t for t in trajectories}
     queries = [(t, t.rollout.length, t.rollout.instruction) for t in trajectories]
@@ -255,11 +258,11 @@ def audit(trajectories: Sequence[Trajectory], goals: Mapping[tuple[str, str], Re
     pairs = [(s, t) for s, t in zip(said, truth, strict=True) if t is not None]
     both = sum(s and t for s, t in pairs)
     yes, true = sum(s for s, _ in pairs), sum(t for _, t in pairs)
-    return {
-        "judged": float(len(pairs)),
-        "said_yes": float(yes),
-        "truly_yes": float(true),
-        "accuracy": float(np.mean([s == t for s, t in pairs])) if pairs else float("nan"),
-        "precision": both / yes if yes else float("nan"),
-        "recall": both / true if true else float("nan"),
-    }
+    scores = {"judged": float(len(pairs)), "said_yes": float(yes), "truly_yes": float(true)}
+    if pairs:
+        scores["accuracy"] = float(np.mean([s == t for s, t in pairs]))
+    if yes:
+        scores["precision"] = both / yes
+    if true:
+        scores["recall"] = both / true
+    return scores

@@ -1,7 +1,7 @@
 """Goals in words: the verbs of an instruction, hindsight relabelling that keeps them, and replies to self-asked questions.
 
 SELU (stage 3) judges an instruction by its words alone. When the critic says that it was not completed, it asks itself which
-objects *are* in the state that the verb aims at, and the instruction is rewritten with the same verb and that object. Everything
+objects *are* in the state that the verb aims at, and the instruction is rewritten with the same verb and that object. All of it
 here is text: no simulator state is read. The sentences and the set of verbs are ours; the paper gives the principle.
 """
 

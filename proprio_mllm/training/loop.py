@@ -1,8 +1,8 @@
 """The one training loop: seeded batches, AdamW, cosine schedule, checkpoints, metrics, progress with time left.
 
-A stage gives an `Objective`: which module trains, the batch of a step, and its loss. The batch of a step is a function of (seed,
-step, process) only, so a run that is killed and resumed ends with the same weights as one that was not. accelerate places the
-module and averages gradients over processes; on one CPU it adds nothing.
+A stage gives an `Objective`: which module trains, the batch of a step, and its loss. The batch of a step is a function of
+(seed, step, process) only, so a run that is killed and resumed ends with the same weights as one that was not. accelerate
+places the module and averages gradients over processes; on one CPU it adds nothing.
 """
 
 from __future__ import annotations
@@ -62,17 +62,29 @@ class LoopResult:
     last: Mapping[str, float]
 
 
-def learning_rate(cfg: LoopConfig, step: int) -> float:
-    """Learning rate of step 0, 1, …: linear warm-up, then a cosine from the peak to a tenth of it."""
+def learning_rate(cfg: LoopConfig, step: int, seconds: float = 0.0) -> float:
+    """Learning rate of step 0, 1, …: linear warm-up, then a cosine from the peak to a tenth of it.
+
+    With a time budget the cosine follows the larger of the shares of steps and of `seconds` that are spent.
+    """
     warmup = min(cfg.warmup, max(cfg.steps // 10, 1))
     if step < warmup:
         return cfg.lr * (step + 1) / warmup
-    done = (step - warmup) / max(cfg.steps - warmup, 1)
+    done = max((step - warmup) / max(cfg.steps - warmup, 1), seconds / (60.0 * cfg.minutes) if cfg.minutes else 0.0)
     return cfg.lr * (0.1 + 0.9 * 0.5 * (1.0 + math.cos(math.pi * min(done, 1.0))))
 
 
-def run_loop(objective: Objective, cfg: LoopConfig, folder: Path, seed: int, writer: MetricWriter, resume: bool = True) -> LoopResult:
-    """Trains an objective to `cfg.steps`, resuming from `folder/checkpoint` when it belongs to the same run.
+def _moved(batch: Any, device: torch.device) -> Any:
+    """Tensors, and batches that can move themselves, on a device; tuples item by item."""
+    if isinstance(batch, tuple):
+        return tuple(_moved(item, device) for item in batch)
+    return batch.to(device) if hasattr(batch, "to") and device.type != "cpu" else batch
+
+
+def run_loop(
+    objective: Objective, cfg: LoopConfig, folder: Path, seed: int, writer: MetricWriter, resume: bool = True
+) -> LoopResult:
+    """Trains an objective to `cfg.steps` or for `cfg.minutes`, resuming from `folder/checkpoint` when it is of the same run.
 
     Raises:
         FloatingPointError: when the loss is not finite; the message names stage and step.
@@ -89,7 +101,7 @@ def run_loop(objective: Objective, cfg: LoopConfig, folder: Path, seed: int, wri
     optimizer = torch.optim.AdamW([group for group in groups if group["params"]], lr=cfg.lr, betas=(0.9, 0.99))
     module, prepared = accelerator.prepare(source, optimizer)
     checkpoint = folder / "checkpoint"
-    first = load_checkpoint(checkpoint, source, optimizer, objective.key) if resume else 0
+    first, spent = load_checkpoint(checkpoint, source, optimizer, objective.key) if resume else (0, 0.0)
     writer.discard_after(first)
     rank = accelerator.process_index
     if first:
@@ -108,11 +120,14 @@ def run_loop(objective: Objective, cfg: LoopConfig, folder: Path, seed: int, wri
         for step in range(first, cfg.steps):
             assert ahead is not None
             batch = ahead.result()
+            seconds = spent + time.monotonic() - began
+            out_of_time = bool(cfg.minutes) and seconds > 60.0 * cfg.minutes
             ahead = pool.submit(make, step + 1) if step + 1 < cfg.steps else None
             for group in optimizer.param_groups:
-                group["lr"] = learning_rate(cfg, step)
+                group["lr"] = learning_rate(cfg, step, seconds)
             generator = torch.Generator().manual_seed((seed * 1_000_003 + step) * 64 + rank)
-            loss, values = objective.loss(module, batch, generator)
+            with torch.autocast(accelerator.device.type, torch.bfloat16, enabled=cfg.precision == "bf16"):
+                loss, values = objective.loss(module, _moved(batch, accelerator.device), generator)
             if not bool(torch.isfinite(loss)):
                 raise FloatingPointError(f"{objective.name}: loss {float(loss.detach())} at step {step}; lower lr ({cfg.lr})")
             accelerator.backward(loss)
@@ -125,15 +140,18 @@ def run_loop(objective: Objective, cfg: LoopConfig, folder: Path, seed: int, wri
             counted += 1
             bar.update(1)
             done = step + 1
-            if done % cfg.log_every == 0 or done == cfg.steps:
+            final = done == cfg.steps or out_of_time
+            if done % cfg.log_every == 0 or final:
                 last = {name: total / sums[f"#{name}"] for name, total in sums.items() if not name.startswith("#")}
-                last["lr"] = learning_rate(cfg, step)
+                last["lr"] = learning_rate(cfg, step, seconds)
                 last["examples_per_s"] = counted * cfg.batch / max(time.monotonic() - began, 1e-9)
                 if accelerator.is_main_process:
                     writer.write(done, last)
                 bar.set_postfix(loss=f"{last['loss']:.3f}", refresh=False)
                 sums = {}
-            if (done % cfg.checkpoint_every == 0 or done == cfg.steps) and accelerator.is_main_process:
-                save_checkpoint(checkpoint, done, source, optimizer, objective.key)
+            if (done % cfg.checkpoint_every == 0 or final) and accelerator.is_main_process:
+                save_checkpoint(checkpoint, done, source, optimizer, objective.key, spent + time.monotonic() - began)
+            if final:
+                break
     module.eval()
-    return LoopResult(cfg.steps, time.monotonic() - began, counted * cfg.batch, last)
+    return LoopResult(first + counted, time.monotonic() - began, counted * cfg.batch, last)

@@ -4,8 +4,8 @@
     <output>/<model>/shared/{text,base,pointmap,tokenizer}
     <output>/<model>/<variant>/{alignment,selu}
 
-A finished stage writes `done.json` with its key (hash of configuration and inputs) and its metrics; the stage is current while the
-key is the one that the present configuration and inputs give.
+A finished stage writes `done.json` with its key (hash of configuration and inputs) and its metrics; the stage is current while
+the key is the one that the present configuration and inputs give.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Runs the training stages in order, each skipped while its output is current.
 
-base needs views, demos and clips (for the tokenizer's text); pointmap needs views; tokenizer needs clips and the windows of views
-and demos; alignment needs base, pointmap and tokenizer; selu needs alignment. The variants of the ablation share everything up
-to alignment and then train with the same budget.
+base needs views, demos and clips (for the tokenizer's text); pointmap needs views; tokenizer needs clips and the windows of
+views and demos; alignment needs base, pointmap and tokenizer; selu needs alignment. The variants of the ablation share
+everything up to alignment and then train with the same budget.
 """
 
 from __future__ import annotations
@@ -194,7 +194,8 @@ class Pipeline:
         tokenizer = MotionTokenizer.load(self.paths.model("tokenizer"))
         views, demos = Views(self.paths.shards("views"), model.cfg), Demos(self.paths.shards("demos"), model.cfg)
         data = AlignmentData(model, tokenizer, Clips(self.paths.shards("clips")), views, demos, self.cfg.alignment)
-        for phase, loop in (("text", self.cfg.alignment.text), ("image", self.cfg.alignment.image), ("joint", self.cfg.alignment.joint)):
+        loops = {phase: getattr(self.cfg.alignment, phase) for phase in PHASES}
+        for phase, loop in loops.items():
             train_only(model, PHASES[phase].groups)
             self.loop(AlignmentObjective(model, data, phase, self.cfg.alignment, f"{key}/{phase}"), loop, folder / phase)
         save_model(model.eval(), self.paths.model("alignment"), tokenizer)

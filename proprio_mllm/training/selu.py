@@ -1,7 +1,7 @@
 """`stage=selu` (paper, stage 3): the actor explores, the critic judges and relabels, both learn from what is kept.
 
-Actor and critic are two LoRA adapters over the stage-2 model: the actor goes on with stage 2's adapter, the critic starts as its
-copy. A round: roll the actor out with a temperature, judge every end, ask oneself and relabel failures keeping the verb,
+Actor and critic are two LoRA adapters over the stage-2 model: the actor goes on with stage 2's adapter, the critic starts as
+its copy. A round: roll the actor out with a temperature, judge every end, ask oneself and relabel failures keeping the verb,
 fine-tune the critic, judge again, fine-tune the actor on the kept trajectories. Before the first round the critic practises on
 questions about the expert's logs. The critic's agreement with the simulator is reported and, unless `truth=oracle`, never used.
 Part of each batch is replayed demonstrations against forgetting; the abstract of SELU mentions no replay.
@@ -187,7 +187,7 @@ class _Selu:
         oracle = OracleJudge({})
         judge: Judge = oracle if self.cfg.truth == "oracle" else ModelJudge(self.model, self.collator, CRITIC)
         learnt, goals = critic_examples(trajectories, judge, style)
-        metrics = {f"before_{name}": value for name, value in audit(trajectories, {}, judge).items()}
+        metrics: dict[str, float] = {f"before_{name}": value for name, value in audit(trajectories, {}, judge).items()}
         for kind in ("direct", "relabel", "negative"):
             metrics[f"critic_{kind}"] = float(sum(one.kind == kind for one in learnt))
         self.tune(

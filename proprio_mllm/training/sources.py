@@ -89,9 +89,11 @@ class Views:
     def __init__(self, folder: Path, cfg: ModelConfig) -> None:
         self.reader = ShardReader(folder, "views")
         self.split = _Split([f"{s}" for s in self.reader.column("seed")], folder)
-        self.type_names: tuple[str, ...] = tuple(json.loads(self.reader.manifest.metadata["type_names"])) if isinstance(
-            self.reader.manifest.metadata["type_names"], str
-        ) else tuple(self.reader.manifest.metadata["type_names"])
+        self.type_names: tuple[str, ...] = (
+            tuple(json.loads(self.reader.manifest.metadata["type_names"]))
+            if isinstance(self.reader.manifest.metadata["type_names"], str)
+            else tuple(self.reader.manifest.metadata["type_names"])
+        )
         self._cfg = cfg
 
     def row(self, index: int) -> ViewRow:

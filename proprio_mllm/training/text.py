@@ -18,7 +18,9 @@ def corpus(cfg: ModelConfig, views: Views, demos: Demos, clips: Clips, seed: int
 
     Args:
         cfg: prompt style.
-        views, demos, clips: shards.
+        views: shards.
+        demos: shards.
+        clips: shards.
         seed: of the choice of rows.
         limit: rows per kind.
     """
