@@ -80,7 +80,8 @@ def automatic_rule(clip: HumanMotion) -> str:
     lowest = float(clip.joints[0, :, 2].min())
     if lowest > _START_AIR_M:
         return f"starts {lowest:.2f} m above the floor"
-    up = (clip.joints[:, [index("left_foot"), index("right_foot")], 2] > _TOES_UP_M).all(axis=1)
+    toes = clip.joints[:, [index("left_foot"), index("right_foot")], 2]
+    up = toes.min(axis=1) > _TOES_UP_M
     longest = max((end - start for start, end in contact_runs(up)), default=0)
     if longest > _TOES_UP_FRAMES:
         return f"both feet above {_TOES_UP_M} m for {longest} frames"

@@ -3,9 +3,9 @@
 For each frame, with q the configuration (floating base included), W the weights and r the residuals below, it iterates
 `q <- q ⊕ -(JᵀWJ + λ)⁻¹ JᵀWr`, with joints held at the bounds that joint limits and joint velocity give.
 
-Residuals: place and orientation of both soles (flat, locked during contact), place and orientation of the pelvis (orientation
-from the human trunk, height lowered until both legs reach), and for each arm the vectors shoulder to elbow and elbow to
-wrist, which are the robot's bone lengths along the human's directions. Lengths scale by the ratio of the legs.
+Residuals, against `data.targets`: place and orientation of both soles (flat, locked during contact), place and orientation
+of the pelvis (orientation from the human trunk, height lowered until both legs reach), and for each arm the vectors shoulder
+to elbow and elbow to wrist, which are the robot's bone lengths along the human's directions.
 Shape letters: T frames, J joints. Frames: world, z up, floor at 0.
 
 Paper: data preparation, "retargeted to the robot". Left out: hands' orientation, objects, self-collision as a constraint.
@@ -14,23 +14,23 @@ Run `python -m data.retarget report` for a table of metrics.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
-from data.contacts import lock, toe_contacts
 from data.motion import FPS, encode_frames, resample
 from data.records import Motion
-from data.skeleton import HumanMotion, index
+from data.skeleton import HumanMotion
+from data.targets import Measures, Targets, make_targets
 from sim.robots.kinematics import RobotModel
 from sim.robots.leg_ik import crouch
 from sim.robots.spec import RobotSpec
 
-__all__ = ["MAX_JOINT_VELOCITY", "Measured", "Retargeted", "Retargeter", "Targets"]
+__all__ = ["MAX_JOINT_VELOCITY", "Measured", "Retargeted", "Retargeter"]
 
 Array = NDArray[np.float64]
 #: rad/s; the slowest limit in H1's vendor description (ankles and shoulders), used for both robots.
@@ -42,31 +42,6 @@ _POSTURE_WEIGHT: Final = 0.03
 _HIP_YAW_WEIGHT: Final = 0.12
 _WEIGHTS: Final = {"sole": 20.0, "sole_rotation": 3.0, "pelvis": 3.0, "pelvis_rotation": 2.0, "arm": 4.0, "shoulders": 2.0}
 _DEFAULT_OPENING: Final = 0.6
-
-
-@dataclass(frozen=True, slots=True)
-class Targets:
-    """What the robot should do, per frame.
-
-    Attributes:
-        pelvis: (T, 3) metres.
-        pelvis_rotation: (T, 3, 3).
-        soles: (T, 2, 3) metres, left and right.
-        sole_rotation: (T, 2, 3, 3), flat.
-        arms: (T, 2, 2, 3) shoulder to elbow and elbow to wrist, metres, left and right.
-        shoulders: (T, 3) from the right to the left shoulder, metres.
-        contact: (T, 2) planted feet.
-        scale: robot metres per human metre.
-    """
-
-    pelvis: Array
-    pelvis_rotation: Array
-    soles: Array
-    sole_rotation: Array
-    arms: Array
-    shoulders: Array
-    contact: NDArray[np.bool_]
-    scale: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,85 +123,27 @@ class Retargeter:
         root = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
         self._reference = self.robot.configuration(root, self._stance)
         pin.framesForwardKinematics(model, data, self._reference)
-        at = lambda name: data.oMf[self.robot.frame_id(self.spec.key_bodies[name])].translation.copy()  # noqa: E731
-        self._hips = np.stack([at("left_hip"), at("right_hip")])  # in the pelvis frame
-        self._thigh = float(np.linalg.norm(at("left_knee") - at("left_hip")))
-        self._shin = float(np.linalg.norm(at("left_ankle") - at("left_knee")))
+        place = {name: data.oMf[self.robot.frame_id(body)].translation.copy() for name, body in self.spec.key_bodies.items()}
         soles = np.stack([data.oMf[i].translation for i in self._soles])
-        self._ankle_above_sole = np.stack([at("left_ankle"), at("right_ankle")]) - soles
-        self._bones = [
-            (
-                float(np.linalg.norm(data.oMf[e].translation - data.oMf[s].translation)),
-                float(np.linalg.norm(data.oMf[w].translation - data.oMf[e].translation)),
-            )
-            for s, e, w in self._arm_frames
-        ]
-        self._shoulder_width = float(np.linalg.norm(at("left_shoulder") - at("right_shoulder")))
-        self._sole_home = [data.oMf[i].rotation.copy() for i in self._soles]
-        self._sole_level = [_level(rotation) for rotation in self._sole_home]
-
-    def targets(self, human: HumanMotion) -> Targets:
-        """What the robot should do to follow a clip that runs at 20 frames per second."""
-        joints = human.joints
-        side = lambda name: joints[:, [index(f"left_{name}"), index(f"right_{name}")]]  # noqa: E731
-        hips, knees, ankles, toes = side("hip"), side("knee"), side("ankle"), side("foot")
-        shoulders, elbows, wrists = side("shoulder"), side("elbow"), side("wrist")
-        leg = float(np.median(_length(hips - knees) + _length(knees - ankles)))
-        scale = (self._thigh + self._shin) / leg
-        contact = toe_contacts(joints, human.fps)
-        # Pelvis orientation: up along the trunk, left along the hips.
-        up = _unit(joints[:, index("neck")] - joints[:, 0])
-        left = hips[:, 0] - hips[:, 1]
-        left = _unit(left - up * np.sum(left * up, axis=1, keepdims=True))
-        rotation = np.stack([np.cross(left, up), left, up], axis=-1)
-        level_left = _unit(left * np.array([1.0, 1.0, 0.0]))
-        # Soles: human mid-foot, moved out to the robot's hip width.
-        human_half = 0.5 * float(np.median(_length(hips[:, 0] - hips[:, 1])))
-        spread = max(0.0, 0.85 * float(self._hips[0, 1]) - scale * human_half)
-        soles, yaws = np.empty((len(joints), 2, 3)), np.empty((len(joints), 2))
-        for foot, sign in ((0, 1.0), (1, -1.0)):
-            floor = _floor_height(ankles[:, foot, 2], contact[:, foot])
-            place = (0.55 * ankles[:, foot] + 0.45 * toes[:, foot]) * scale + sign * spread * level_left
-            place[:, 2] = np.where(contact[:, foot], 0.0, np.maximum(ankles[:, foot, 2] - floor, 0.0) * scale)
-            toward = toes[:, foot] - ankles[:, foot]
-            yaw = np.unwrap(np.arctan2(toward[:, 1], toward[:, 0]))
-            locked = lock(np.column_stack([place, yaw]), contact[:, foot])
-            soles[:, foot], yaws[:, foot] = locked[:, :3], locked[:, 3]
-        soles[..., 2] = np.maximum(soles[..., 2], 0.0)
-        turn = _about_z(yaws)  # (T, 2, 3, 3)
-        sole_rotation = np.stack([turn[:, foot] @ self._sole_level[foot] for foot in (0, 1)], axis=1)
-        ankle_targets = soles + np.stack([(turn[:, foot] @ self._ankle_above_sole[foot]) for foot in (0, 1)], axis=1)
-        # Pelvis place: hips scaled about the floor, then lowered until both legs reach.
-        floor = min(_floor_height(ankles[:, foot, 2], contact[:, foot]) for foot in (0, 1))
-        middle = 0.5 * (hips[:, 0] + hips[:, 1])
-        hip_middle = middle * scale
-        hip_middle[:, 2] = (middle[:, 2] - floor) * scale + float(self._ankle_above_sole[0, 2])
-        offsets = np.einsum("tij,fj->tfi", rotation, self._hips)
-        pelvis = hip_middle - offsets.mean(axis=1)
-        lowest = self.spec.pelvis_height_range_m[0]
-        pelvis[:, 2] = np.maximum(self._reachable(pelvis, offsets, ankle_targets), lowest)
-        arms = np.empty((len(joints), 2, 2, 3))
-        for arm in (0, 1):
-            arms[:, arm, 0] = _unit(elbows[:, arm] - shoulders[:, arm]) * self._bones[arm][0]
-            arms[:, arm, 1] = _unit(wrists[:, arm] - elbows[:, arm]) * self._bones[arm][1]
-        across = _unit(shoulders[:, 0] - shoulders[:, 1]) * self._shoulder_width
-        return Targets(pelvis, rotation, soles, sole_rotation, arms, across, contact, scale)
-
-    def _reachable(self, pelvis: Array, hip_offsets: Array, ankles: Array) -> Array:
-        flat = _length((pelvis[:, None] + hip_offsets - ankles)[..., :2])
-        leg = 0.985 * (self._thigh + self._shin)
-        rise = np.sqrt(np.maximum(leg**2 - np.minimum(flat, 0.95 * leg) ** 2, 0.0))
-        limit = np.minimum(pelvis[:, 2], np.min(ankles[..., 2] + rise - hip_offsets[..., 2], axis=1))
-        if len(limit) < 5:
-            return limit
-        return np.minimum(gaussian_filter1d(minimum_filter1d(limit, 3), 1.0, mode="nearest"), limit)
+        bones = [[data.oMf[frame].translation.copy() for frame in frames] for frames in self._arm_frames]
+        self._sole_level = [_level(data.oMf[i].rotation) for i in self._soles]
+        self.measures = Measures(
+            hips=np.stack([place["left_hip"], place["right_hip"]]),
+            thigh_m=_distance(place["left_hip"], place["left_knee"]),
+            shin_m=_distance(place["left_knee"], place["left_ankle"]),
+            ankle_above_sole=np.stack([place["left_ankle"], place["right_ankle"]]) - soles,
+            arms_m=tuple((_distance(s, e), _distance(e, w)) for s, e, w in bones),
+            shoulder_width_m=_distance(place["left_shoulder"], place["right_shoulder"]),
+            sole_level=np.stack(self._sole_level),
+            lowest_pelvis_m=self.spec.pelvis_height_range_m[0],
+        )
 
     def __call__(self, human: HumanMotion) -> Retargeted:
         """Retargets one clip; motions of another rate are resampled to 20 frames per second first."""
         if human.fps != FPS:
             opening = None if human.hand_opening is None else resample(human.hand_opening, human.fps)
             human = HumanMotion(human.name, resample(human.joints, human.fps), FPS, human.captions, opening, human.split)
-        targets = self.targets(human)
+        targets = make_targets(human, self.measures)
         frames = len(human.joints)
         opening = (
             np.full((frames, 2), _DEFAULT_OPENING) if human.hand_opening is None else np.clip(human.hand_opening, 0.0, 1.0)
@@ -340,7 +257,7 @@ class Retargeter:
 
 def _bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) -> Array:
     """Newton step whose joint part (all but the first six entries) stays within bounds; joints that would leave are held."""
-    step = -np.linalg.solve(hessian, gradient)
+    step: Array = -np.linalg.solve(hessian, gradient).astype(np.float64)
     held = np.zeros(len(step), dtype=bool)
     for _ in range(3):
         joints = step[6:]
@@ -356,23 +273,8 @@ def _bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) -
     return step
 
 
-def _length(vectors: Array) -> Array:
-    lengths: Array = np.linalg.norm(vectors, axis=-1).astype(np.float64)
-    return lengths
-
-
-def _unit(vectors: Array) -> Array:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
-
-
-def _floor_height(ankle_z: Array, contact: NDArray[np.bool_]) -> float:
-    return float(np.median(ankle_z[contact])) if contact.any() else float(np.min(ankle_z))
-
-
-def _about_z(yaw_rad: Array) -> Array:
-    cos, sin, zero, one = np.cos(yaw_rad), np.sin(yaw_rad), np.zeros_like(yaw_rad), np.ones_like(yaw_rad)
-    rows = [np.stack(row, axis=-1) for row in ([cos, -sin, zero], [sin, cos, zero], [zero, zero, one])]
-    return np.stack(rows, axis=-2)
+def _distance(a: Array, b: Array) -> float:
+    return float(np.linalg.norm(b - a))
 
 
 def _level(rotation: Array) -> Array:
@@ -382,3 +284,9 @@ def _level(rotation: Array) -> Array:
         row = int(np.argmax(np.abs(rotation[:, column])))
         snapped[row, column] = np.sign(rotation[row, column])
     return snapped
+
+
+if __name__ == "__main__":
+    from data.retarget_report import main
+
+    sys.exit(main(sys.argv[1:]))

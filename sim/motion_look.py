@@ -1,0 +1,102 @@
+"""Pictures of retargeting: the human skeleton above, each robot below, at a few instants of a clip.
+
+    python -m sim.motion_look 2 9 12      # numbers of generated clips; pictures go to outputs/look
+
+Paper: none; to look at what the numbers cannot show.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from data.generator import generate_clip
+from data.retarget import Retargeter
+from data.skeleton import CHAINS, HumanMotion
+from sim.robots.spec import load_robot
+
+__all__ = ["main", "strip"]
+
+mpl.use("Agg")
+_SIZE = 300
+
+
+def _human(joints: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.uint8]:
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(3, 3), dpi=_SIZE // 3)
+    axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d")
+    for chain in CHAINS:
+        points = joints[list(chain)]
+        axes.plot(*points.T, color="tab:red" if chain[-1] in (10, 20) else "tab:blue", linewidth=2)  # left is red
+    axes.set(xlim=centre[0] + np.array([-0.75, 0.75]), ylim=centre[1] + np.array([-0.75, 0.75]), zlim=(0.0, 1.9))
+    axes.set_box_aspect((1.5, 1.5, 1.9), zoom=1.3)
+    axes.view_init(elev=8, azim=35)
+    axes.set_axis_off()
+    figure.canvas.draw()
+    picture = np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
+    plt.close(figure)
+    return picture
+
+
+def _robot(retargeter: Retargeter, clip: HumanMotion, frames: list[int]) -> list[NDArray[np.uint8]]:
+    motion = retargeter(clip).motion
+    assert motion.root_pose is not None
+    assert motion.joint_positions is not None
+    spec = mujoco.MjSpec.from_file(str(retargeter.spec.mjcf_path))
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[4, 4, 0.1], rgba=[0.8, 0.8, 0.8, 1])
+    for side in (-1.0, 1.0):
+        spec.worldbody.add_light(
+            pos=[3.0, 2.0 * side, 3.0],
+            dir=[-0.7, -0.5 * side, -0.6],
+            type=int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL),
+            castshadow=False,
+        )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    camera = mujoco.MjvCamera()
+    scale = retargeter.spec.standing_pelvis_height_m
+    camera.distance, camera.azimuth, camera.elevation = 3.4 * scale, 215.0, -8.0
+    pictures = []
+    with mujoco.Renderer(model, _SIZE, _SIZE) as renderer:
+        for frame in frames:
+            pose = motion.root_pose[frame]
+            data.qpos[:7] = pose
+            for name, value in zip(retargeter.robot.joint_names, motion.joint_positions[frame], strict=True):
+                data.qpos[model.joint(name).qposadr[0]] = value
+            mujoco.mj_forward(model, data)
+            camera.lookat[:] = [pose[0], pose[1], 0.9 * scale]
+            renderer.update_scene(data, camera)
+            pictures.append(renderer.render().copy())
+    return pictures
+
+
+def strip(clip: HumanMotion, retargeters: list[Retargeter], columns: int = 7) -> NDArray[np.uint8]:
+    """One picture: the human in the first row, one robot in each further row, time to the right."""
+    frames = [int(f) for f in np.linspace(0, len(clip.joints) - 1, columns)]
+    rows = [[_human(clip.joints[f], clip.joints[f, 0]) for f in frames]]
+    rows += [_robot(retargeter, clip, frames) for retargeter in retargeters]
+    return np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0)
+
+
+def main(numbers: list[int], folder: Path) -> list[Path]:
+    """Writes a strip for each generated clip; returns the paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    retargeters = [Retargeter(load_robot(name)) for name in ("h1", "x1")]
+    paths = []
+    for number in numbers:
+        path = folder / f"motion_{number:04d}.png"
+        Image.fromarray(strip(generate_clip(0, number), retargeters)).save(path)
+        paths.append(path)
+    return paths
+
+
+if __name__ == "__main__":
+    main([int(argument) for argument in sys.argv[1:]] or [0, 8, 12], Path("outputs/look"))
