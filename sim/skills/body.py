@@ -72,11 +72,13 @@ class BothGoal:
         arms: (A,) joints per arm.
         waist: waist joints.
         error_m: largest distance of a grasp site from its wish.
+        tilt_rad: largest angle between a wished and a reached pointing direction.
     """
 
     arms: Mapping[Arm, Array]
     waist: Array
     error_m: float
+    tilt_rad: float = 0.0
 
 
 class Body:
@@ -184,6 +186,17 @@ class Body:
         if thing.toggle_site >= 0 and not thing.type.pickupable:
             return self.world.data.site_xpos[thing.toggle_site].copy()
         return self.world_position(object_id)
+
+    def faces_rad(self, object_id: str) -> tuple[float, ...]:
+        """World directions out of an object in which a robot stands well: its front, or all sides of what two hands lift."""
+        thing = self.thing(object_id)
+        front = self.world.front(object_id)
+        angle = float(np.arctan2(front[1], front[0]))
+        if thing.movable:
+            return tuple(angle + k * np.pi / 2.0 for k in range(4)) if self.world.needs_two_hands(object_id) else ()
+        if any(surface.spec.all_sides for surface in thing.surfaces):
+            return ()
+        return (angle,)
 
     def rests(self, thing: ObjectInstance) -> bool:
         """Whether an object touches something that is not part of the robot, from above."""
@@ -339,7 +352,7 @@ class Body:
                 None if local.closing is None else lean.T @ local.closing,
                 local.either_way,
             )
-            starts = list(reach_map.starts(upright, 2))
+            starts = list(reach_map.starts(upright, 2, near=self.ready(arm)))
         else:
             starts = [start]
         best: tuple[float, ArmGoal] | None = None
@@ -392,13 +405,13 @@ class Body:
             if local.pointing is None or local.closing is None:
                 raise ValueError(f"both directions of the {arm} hand must be given, got {wish}")
             rotation = local.rotation(local.pointing, local.closing)
-            targets[arm.value] = ReachTarget(local.position, rotation, 0.08, 0.05)
+            targets[arm.value] = ReachTarget(local.position, rotation, 0.15, 0.08)
             upright = HandPose(lean.T @ local.position, lean.T @ local.pointing, lean.T @ local.closing)
-            q[self._columns[arm]] = self.maps[arm.value].starts(upright, 1)[0] if start is None else start[arm]
+            q[self._columns[arm]] = self.maps[arm.value].starts(upright, 1, near=self.ready(arm))[0] if start is None else start[arm]
         result = self.whole_body.solve(targets, q, pelvis_height_m=height, restarts=1, tolerance_m=REACH_TOLERANCE_M)
         waist = self.kinematics.indices(self.spec.waist_joints)
         arms = {arm: result.q[self._columns[arm]].copy() for arm in Arm}
-        return BothGoal(arms, result.q[waist].copy(), result.position_error_m)
+        return BothGoal(arms, result.q[waist].copy(), result.position_error_m, result.rotation_error_rad)
 
     def heights_in_reach(self, arm: Arm, point: Array) -> list[float]:
         """Pelvis heights, of a grid over the robot's range, at which the arm would reach a world point from this stance."""
@@ -416,7 +429,7 @@ class Body:
         if arm not in self._vias:
             reach_map = self.maps[arm.value]
             high = reach_map.shoulder + reach_map.reach_m * np.array([0.6, 0.0, -0.05])
-            self._vias[arm] = (self.ready(arm), reach_map.starts(HandPose(high, np.array([1.0, 0.0, 0.0])), 1)[0])
+            self._vias[arm] = (self.ready(arm), reach_map.starts(HandPose(high, np.array([1.0, 0.0, 0.0])), 1, near=self.ready(arm))[0])
         return self._vias[arm]
 
     # ---- motions
@@ -454,10 +467,6 @@ class Body:
             time_s += CONTROL_DT_S
             self.world.data.ctrl[ids] = way.at(time_s)
             yield
-
-    def high_both(self) -> BothGoal:
-        """Both hands forward at shoulder height, waist straight: the way over what stands before the robot."""
-        return BothGoal({arm: self.vias(arm)[1] for arm in Arm}, np.zeros(len(self._waist_ids)), 0.0)
 
     def stow_both(self) -> Skill:
         """Both arms to their ready postures, waist straight."""
@@ -511,13 +520,14 @@ def ready_posture(robot_name: str, arm: Arm) -> Array:
     rotation = wish.rotation(wish.pointing, inward) if wish.pointing is not None else np.eye(3)
     height = kit.spec.standing_pelvis_height_m
     best: tuple[float, Array] | None = None
-    for start in reach_map.starts(wish, 12, radius_m=0.2):
+    for start in reach_map.starts(wish, 12, radius_m=0.2, near=np.array(kit.spec.arms[arm.value].carry)):
         q = kit.model.posture()
         q[columns] = start
         target = ReachTarget(point, rotation, 0.3, 0.2)
         result = solver.solve({arm.value: target}, q, pelvis_height_m=height, restarts=0)
         hand = kit.model.frames(root, result.q, site)[0, :3, :3]
-        cost = 5.0 * result.position_error_m + 2.0 - float(hand[0, 0]) - float(hand[:, 1] @ inward)
+        away = result.q[columns] - kit.spec.arms[arm.value].carry
+        cost = 5.0 * result.position_error_m + 2.0 - float(hand[0, 0]) - float(hand[:, 1] @ inward) + 0.05 * float(away @ away)
         if best is None or cost < best[0]:
             best = (cost, result.q[columns].copy())
     assert best is not None

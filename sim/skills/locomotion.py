@@ -8,6 +8,7 @@ Paper: body actions of the DualTHOR action space. GoTo replaces the paper's tele
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -22,9 +23,9 @@ from sim.trajectory import plan, plan_polyline
 
 __all__ = ["best_stance", "change_height", "go_to", "move", "rotate"]
 
-WALK_SPEED_M_S: Final = 0.8
-WALK_ACCELERATION_M_S2: Final = 1.6
-TURN_SPEED_RAD_S: Final = 1.8
+WALK_SPEED_M_S: Final = 0.9
+WALK_ACCELERATION_M_S2: Final = 2.0
+TURN_SPEED_RAD_S: Final = 2.2
 TURN_ACCELERATION_RAD_S2: Final = 5.0
 HEIGHT_SPEED_M_S: Final = 0.35
 HEIGHT_ACCELERATION_M_S2: Final = 1.0
@@ -33,6 +34,8 @@ HEIGHT_ACCELERATION_M_S2: Final = 1.0
 _DIRECTIONS: Final = {"MoveAhead": 0.0, "MoveLeft": np.pi / 2, "MoveBack": np.pi, "MoveRight": -np.pi / 2}
 #: GoTo walks backwards or sideways over ways shorter than this, and turns into the way before longer ones.
 _SIDESTEP_M: Final = 0.5
+#: Metres of walking that one radian off the object's face is worth.
+_FACE_WEIGHT: Final = 3.0
 #: Preference of near over exact: metres of walking that one metre of deviation from the comfortable distance is worth.
 _DISTANCE_WEIGHT: Final = 6.0
 
@@ -135,6 +138,7 @@ def best_stance(
     comfort_m: tuple[float, float],
     distance_m: float | None,
     bearing_rad: float,
+    faces_rad: Sequence[float] = (),
 ) -> tuple[Stance, NDArray[np.float64]] | None:
     """The stance for GoTo and the way there.
 
@@ -145,6 +149,7 @@ def best_stance(
         comfort_m: range of distances the arms like; the middle is preferred.
         distance_m: distance asked for, None for the most comfortable one that is free.
         bearing_rad: bearing of the object after arrival.
+        faces_rad: directions out of the object in which it is best approached; any direction when empty.
 
     Returns:
         The stance and a polyline (N, 2) to it, None when no free stance can be reached.
@@ -166,6 +171,10 @@ def best_stance(
             off = abs(float(np.linalg.norm(stance.position - target)) - middle)
             turn = abs(wrap_angle(stance.yaw_rad - start.yaw_rad))
             cost = way_m + _DISTANCE_WEIGHT * off + 0.1 * turn
+            if faces_rad:
+                delta = stance.position - target
+                side = float(np.arctan2(delta[1], delta[0]))
+                cost += _FACE_WEIGHT * min(abs(wrap_angle(side - face)) for face in faces_rad)
             if np.isfinite(cost) and (best is None or cost < best[0] - 1e-9):
                 best = (cost, stance)
         if best is not None:
@@ -186,7 +195,13 @@ def go_to(body: Body, action: Action) -> Skill:
     bearing = np.deg2rad(action.bearing_deg) if action.bearing_deg is not None else 0.0
     start = body.commanded_base()
     found = best_stance(
-        body.navigation(), start, target, body.comfortable_distance_m(), action.amount, bearing
+        body.navigation(),
+        start,
+        target,
+        body.comfortable_distance_m(),
+        action.amount,
+        bearing,
+        body.faces_rad(action.object_id),
     )
     if found is None:
         raise SkillFailure(FailureCode.NO_FREE_POSE)

@@ -30,6 +30,8 @@ _SAMPLES: Final = 60000
 _ENVELOPE_M: Final = 0.045
 #: Weight of the position error (per metre) against the orientation error (1 - cosine) when a posture is chosen.
 _POSITION_WEIGHT: Final = 10.0
+#: Weight of the squared distance (rad^2) from a preferred posture.
+_POSTURE_WEIGHT: Final = 0.06
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,19 +97,28 @@ class ReachMap:
         """How far a point lies beyond the stretched arm, negative inside."""
         return float(np.linalg.norm(point - self.shoulder)) - self.reach_m
 
-    def starts(self, wish: HandPose, count: int, radius_m: float = 0.12) -> Array:
-        """(N <= count, A) sampled postures that fulfil a wish best, best first; at least one."""
-        near = np.asarray(self.tree.query_ball_point(wish.position, radius_m), dtype=np.int64)
-        if len(near) == 0:
-            near = np.array([int(self.tree.query(wish.position)[1])])
-        cost = _POSITION_WEIGHT * np.linalg.norm(self.positions[near] - wish.position, axis=1)
+    def starts(self, wish: HandPose, count: int, radius_m: float = 0.12, near: Array | None = None) -> Array:
+        """(N <= count, A) sampled postures that fulfil a wish best, best first; at least one.
+
+        Args:
+            wish: hand pose in the pelvis frame.
+            count: how many.
+            radius_m: how far from the wish a sampled hand may be.
+            near: (A,) posture to stay close to, so that the arm does not wind itself up.
+        """
+        rows = np.asarray(self.tree.query_ball_point(wish.position, radius_m), dtype=np.int64)
+        if len(rows) == 0:
+            rows = np.array([int(self.tree.query(wish.position)[1])])
+        cost = _POSITION_WEIGHT * np.linalg.norm(self.positions[rows] - wish.position, axis=1)
         if wish.pointing is not None:
-            cost = cost + (1.0 - self.x_axes[near] @ wish.pointing)
+            cost = cost + (1.0 - self.x_axes[rows] @ wish.pointing)
         if wish.closing is not None:
-            along = self.y_axes[near] @ wish.closing
+            along = self.y_axes[rows] @ wish.closing
             cost = cost + (1.0 - (np.abs(along) if wish.either_way else along))
+        if near is not None:
+            cost = cost + _POSTURE_WEIGHT * np.sum((self.q[rows] - near) ** 2, axis=1)
         order = np.argsort(cost, kind="stable")
-        return self.q[near[order[:count]]]
+        return self.q[rows[order[:count]]]
 
 
 @lru_cache(maxsize=4)

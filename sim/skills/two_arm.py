@@ -20,7 +20,7 @@ from sim.skills.body import Body, BothGoal, wait
 from sim.skills.checks import check_lift, check_place_both
 from sim.skills.grasps import solid_box
 from sim.skills.manipulate import GRASP_GAP_M, Luck
-from sim.skills.reach import out_of_reach
+from sim.skills.reach import out_of_reach, route
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill
 
@@ -28,8 +28,10 @@ __all__ = ["assess_lift", "assess_place_both", "lift", "place_both"]
 
 Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
-_APART_M: Final = 0.09
+_APART_M: Final = 0.125
 _TOLERANCE_M: Final = 0.02
+#: Tilt up to which a lifted object counts as level.
+_LEVEL_RAD: Final = 0.2
 #: Ways to hold what was lifted: metres up and towards the body, the best first.
 _HOLDS: Final = ((0.25, 0.1), (0.2, 0.06), (0.15, 0.05), (0.12, 0.0), (0.3, 0.0), (0.08, 0.0))
 
@@ -38,6 +40,7 @@ _HOLDS: Final = ((0.25, 0.1), (0.2, 0.06), (0.15, 0.05), (0.12, 0.0), (0.3, 0.0)
 class BothReach:
     """A motion of both hands: around the object, before it, and pressing on it."""
 
+    way: BothGoal
     before: BothGoal
     at: BothGoal
 
@@ -89,7 +92,23 @@ def assess_lift(body: Body, action: Action) -> BothReach:
     at = _goal(body, sides, 0.004, before.arms)
     if before.error_m > _TOLERANCE_M or at.error_m > _TOLERANCE_M:
         raise _unreachable(body, {arm: point for arm, (point, _) in sides.items()})
-    return BothReach(before, at)
+    name = (thing.object_id,)
+    for arm in Arm:
+        if not (body.probe.free(arm, [before.arms[arm]], opening=1.0) and body.probe.free(arm, [at.arms[arm]], name, 1.0)):
+            raise SkillFailure(FailureCode.OBSTRUCTED, {"gap_m": 0.0})
+    return BothReach(_way(body, before), before, at)
+
+
+def _way(body: Body, goal: BothGoal) -> BothGoal:
+    """A posture of both arms half way to a goal, by a detour where the straight way meets something."""
+    middle: dict[Arm, Array] = {}
+    for arm in Arm:
+        start = body.commanded_arm(arm)
+        found = route(body, arm, start, goal.arms[arm], (), 1.0)
+        if found is None:
+            found = (body.vias(arm)[1],)
+        middle[arm] = found[0] if found else 0.5 * (start + goal.arms[arm])
+    return BothGoal(middle, 0.5 * (body.commanded_waist() + goal.waist), 0.0)
 
 
 def _unreachable(body: Body, points: Mapping[Arm, Array]) -> SkillFailure:
@@ -119,7 +138,7 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
     thing = body.thing(action.object_id)
     for arm in Arm:
         body.command_hand(arm, 1.0)
-    yield from body.move_both([body.high_both(), reach.before])
+    yield from body.move_both([reach.way, reach.before])
     yield from _press(body, reach, thing)
     gaps = {arm: body.probe.hand_gap_m(arm, body.solid_geoms(thing)) for arm in Arm}
     if max(gaps.values()) > GRASP_GAP_M:
@@ -140,11 +159,10 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
         yield from body.stow_both()
         code = FailureCode.SPILLED if outcome == "spilled" else FailureCode.SLIPPED
         raise SkillFailure(code, contingency=outcome)
-    for up, back in _HOLDS:
-        goal = _shifted(body, up, back)
-        if goal.error_m <= _TOLERANCE_M:
-            yield from body.move_both([goal], speed=0.5)
-            break
+    goals = [goal for goal in (_shifted(body, up, back) for up, back in _HOLDS) if goal.error_m <= _TOLERANCE_M]
+    if goals:
+        level = next((goal for goal in goals if goal.tilt_rad < _LEVEL_RAD), min(goals, key=lambda goal: goal.tilt_rad))
+        yield from body.move_both([level], speed=0.5)
     yield from wait(0.1)
     if body.lifted != thing.object_id or thing.object_id in body.world.all_parents():
         raise SkillFailure(FailureCode.DROPPED)
