@@ -1,6 +1,6 @@
 """Table of retargeting metrics: `python -m data.retarget report [clips]`.
 
-Rows: generated clips per robot, and each real clip that `make motions` installed. Targets that the project sets itself are in the
+Columns: generated clips per robot, and each real clip that `make motions` installed. What the project aims at is in the
 last column.
 
 Paper: none.
@@ -64,7 +64,10 @@ def measure(retargeter: Retargeter, clips: Iterable[HumanMotion]) -> tuple[Metri
 
 def table(columns: Sequence[tuple[str, Metrics, float]]) -> Table:
     """A table with one column per (name, metrics, ms per frame)."""
-    out = Table("metric", *(name for name, _, _ in columns), "aim at most")
+    out = Table()
+    out.add_column("metric", no_wrap=True)
+    for heading in (*(name for name, _, _ in columns), "aim at most"):
+        out.add_column(heading)
     for name, aim in TARGETS.items():
         values = [dataclasses.asdict(metrics)[name] for _, metrics, _ in columns]
         out.add_row(name, *("-" if np.isnan(v) else f"{v:.2f}" for v in values), aim)
