@@ -35,7 +35,7 @@ def main(overrides: Sequence[str]) -> int:
     try:
         cfg = build(EvalConfig, compose("eval", overrides))
     except ConfigError as error:
-        console.print(f"eval.py: {error}", style="red", markup=False)
+        console.print(f"eval.py: {error}", style="red", markup=False, soft_wrap=True)
         return 2
     from proprio_mllm.evaluation.run import evaluate  # loads the simulator; a typo above stops before that
     from proprio_mllm.planners.protocol import WeightsError
@@ -44,18 +44,18 @@ def main(overrides: Sequence[str]) -> int:
 
     if cfg.experiment is not None:
         table, files = assemble(cfg.experiment, Path(cfg.output))
-        console.print("\n".join(f"written: {path}" for path in files), markup=False)
+        console.print("\n".join(f"written: {path}" for path in files), markup=False, soft_wrap=True)
         if table is not None:
             table.show()
         return 0
     try:
         folder = evaluate(cfg).folder
     except (WeightsError, ValueError) as error:
-        console.print(f"eval.py: {error}", style="red", markup=False)
+        console.print(f"eval.py: {error}", style="red", markup=False, soft_wrap=True)
         return 1 if isinstance(error, WeightsError) else 2
     run = load_run(folder)
     table = write_report(run)
-    console.print(f"ledger, summary.json and tables: {folder}", markup=False)
+    console.print(f"ledger, summary.json and tables: {folder}", markup=False, soft_wrap=True)
     table.show()
     return 0 if run.complete else 1
 

@@ -10,6 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+import yaml
+
+from configs.compose import CONFIG_DIR
 from configs.schema.eval import ExperimentConfig
 from proprio_mllm.report.figures import distribution_figures, failure_figure
 from proprio_mllm.report.paper import PAPER_ROWS, paper_ablation, paper_main, paper_replanning
@@ -22,9 +25,9 @@ _CATEGORIES: Final = ("essential", "optional", "single")
 _PAPER_NOTE: Final = "paper: printed in the paper, another simulator and a 7B model; not comparable in size, shown apart."
 
 
-def _label(name: str, runs: Sequence[Run]) -> str:
-    run = next((run for run in runs if run.metadata["planner"] == name), None)
-    return name if run is None else str(run.metadata["label"])
+def _label(name: str) -> str:
+    path = CONFIG_DIR / "planner" / f"{name}.yaml"
+    return str(yaml.safe_load(path.read_text(encoding="utf-8"))["label"]) if path.is_file() else name
 
 
 def _cell(runs: Sequence[Run], planner: str, robot: str, difficulty: str, category: str) -> str:
@@ -39,7 +42,7 @@ def main_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
     columns = ("planner", "source", *(f"{category} {robot}" for category, robot in places))
     difficulty = cfg.difficulties[0]
     ours = [
-        (_label(name, runs), "ours", *(_cell(runs, name, robot, difficulty, category) for category, robot in places))
+        (_label(name), "ours", *(_cell(runs, name, robot, difficulty, category) for category, robot in places))
         for name in cfg.planners
     ]
     printed = [
@@ -54,7 +57,7 @@ def replanning_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
     """Success at each difficulty on dual-arm essential tasks."""
     robot = cfg.robots[0]
     ours = [
-        (_label(name, runs), "ours", *(_cell(runs, name, robot, difficulty, "essential") for difficulty in cfg.difficulties))
+        (_label(name), "ours", *(_cell(runs, name, robot, difficulty, "essential") for difficulty in cfg.difficulties))
         for name in cfg.planners
     ]
     printed = [
@@ -82,7 +85,7 @@ def ablation_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
         if values is not None:
             counts = (f"{values[kind]:.0f}" for kind in ("navigation", "body_adjustment", "logical"))
             printed = (f"{values['success_percent']:.2f}", *counts)
-        body.append((_label(name, runs), *own, *printed))
+        body.append((_label(name), *own, *printed))
     kinds = ("success", "navigation", "body adj.", "logical")
     columns = ("planner", *kinds, *(f"paper {kind}" for kind in kinds))
     notes = ("The paper counts failures over 133 tasks x 50 trials.", _PAPER_NOTE)

@@ -13,7 +13,7 @@ from proprio_mllm.evaluation.ledger import read_ledger
 from proprio_mllm.report.summary import CATEGORIES, SUMMARY_VERSION, Row, rows_of, write_json
 from proprio_mllm.report.table import Table, run_table
 
-__all__ = ["Run", "find_runs", "load_run", "write_report"]
+__all__ = ["Run", "find_runs", "load_run", "newest", "run_report", "write_report"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,11 +91,15 @@ def _notes(run: Run) -> list[str]:
     return notes
 
 
+def run_report(run: Run) -> Table:
+    """The table of a run."""
+    meta = run.metadata
+    return run_table(f"{meta['label']} · {meta['robot']} · {meta['difficulty']}", run.rows(), _notes(run))
+
+
 def write_report(run: Run) -> Table:
     """Writes the report files of a run and returns its table."""
-    meta, rows = run.metadata, run.rows()
-    title = f"{meta['label']} · {meta['robot']} · {meta['difficulty']}"
-    table = run_table(title, rows, _notes(run))
+    meta, rows, table = run.metadata, run.rows(), run_report(run)
     summary = {
         "schema_version": SUMMARY_VERSION,
         **{name: meta[name] for name in ("planner", "label", "privileged", "robot", "difficulty", "config_hash")},

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table as RichTable
 
@@ -61,10 +62,12 @@ class Table:
 
     def show(self, console: Console | None = None) -> None:
         """Prints notes first and the table last, so that a run ends with its rows."""
-        console = console or Console(width=max(120, Console().width), highlight=False)
+        width = sum(max(len(cell) for cell in column) + 3 for column in zip(self.columns, *self.rows, strict=True))
+        # Cells are never cut: on a narrow terminal the lines wrap instead.
+        console = console or Console(width=max(width + 4, Console().width), highlight=False)
         for note in self.notes:
             console.print(note, style="dim", markup=False)
-        grid = RichTable(title=self.title, title_justify="left", show_edge=False)
+        grid = RichTable(title=self.title, title_justify="left", show_edge=False, box=SIMPLE_HEAD)
         for number, column in enumerate(self.columns):
             grid.add_column(column, justify="left" if number == 0 else "right", no_wrap=True)
         for row in self.rows:
@@ -88,15 +91,14 @@ def run_table(title: str, rows: Sequence[Row], notes: Sequence[str] = ()) -> Tab
     columns = (
         "category",
         "success",
-        "% ",
+        "%",
         "95% interval",
         "navigation",
         "body adj.",
         "logical",
-        "goals met",
-        "budget",
         "invalid",
-        "steps",
+        "budget",
+        "goals %",
         "calls",
         "tokens",
     )
@@ -109,10 +111,9 @@ def run_table(title: str, rows: Sequence[Row], notes: Sequence[str] = ()) -> Tab
             str(row.navigation),
             str(row.body_adjustment),
             str(row.logical),
-            _number(100 * row.goal_conditions),
-            str(row.budget_exhausted),
             str(row.invalid_output),
-            _number(row.steps),
+            str(row.budget_exhausted),
+            _number(100 * row.goal_conditions),
             _number(row.calls),
             _number(row.tokens, 0),
         )

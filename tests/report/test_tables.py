@@ -106,7 +106,7 @@ def test_main_table_keeps_ours_and_the_papers_apart(tmp_path, run) -> None:
     assert "/4" in table.rows[0][column]
     assert table.rows[0][table.columns.index("essential x1")] == ""  # not run
     assert set(table.rows[1][2:]) == {""}
-    assert next(row for row in table.rows if row[0] == "Proprio-MLLM")[column] == "63.16"
+    assert next(row for row in table.rows if row[:2] == ("Proprio-MLLM", "paper"))[column] == "63.16"
 
 
 def test_ablation_and_replanning(tmp_path, run) -> None:

@@ -1,0 +1,66 @@
+"""The command line: composition of every override that is allowed, and what is said about those that are not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import eval as command
+from configs.compose import CONFIG_DIR, compose
+from configs.schema.eval import EvalConfig
+from configs.validate import build
+
+
+@pytest.mark.parametrize("planner", sorted(path.stem for path in (CONFIG_DIR / "planner").glob("*.yaml")))
+@pytest.mark.parametrize("robot", ["h1", "x1"])
+def test_every_planner_composes(planner: str, robot: str) -> None:
+    cfg = build(EvalConfig, compose("eval", [f"planner={planner}", f"robot={robot}", "difficulty=hard", "trials=3"]))
+    assert (cfg.planner.name, cfg.robot.name, cfg.difficulty, cfg.trials) == (planner, robot, "hard", 3)
+    assert cfg.experiment is None
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONFIG_DIR / "experiment").glob("*.yaml")))
+def test_every_experiment_composes_with_known_planners(name: str) -> None:
+    cfg = build(EvalConfig, compose("eval", [f"experiment={name}"]))
+    assert cfg.experiment is not None
+    assert cfg.experiment.name == name
+    assert all((CONFIG_DIR / "planner" / f"{planner}.yaml").is_file() for planner in cfg.experiment.planners)
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("planer=proprio", "difficulty"),
+        ("planner=gpt", "proprio_no_mpe"),
+        ("robot=h2", "h1, x1"),
+        ("difficulty=brutal", "easy, medium, hard"),
+        ("category=both", "single, optional, essential"),
+        ("start=anywhere", "fixed, turned"),
+        ("trials=0", "trials 0"),
+        ("workers=-1", "workers -1"),
+        ("limit=0", "limit 0"),
+        ("retries=-2", "retries -2"),
+        ("seed=-1", "seed -1"),
+        ("trials=many", "many"),
+        ("planner.image_size=big", "big"),
+        ("tasks=/nowhere/tasks.jsonl", "nowhere"),
+        ("robot.mjcf=/tmp/x.xml", "robot.spec"),
+    ],
+)
+def test_wrong_words_stop_with_what_is_allowed(
+    override: str, said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert command.main(["planner=random", f"output={tmp_path}", override]) == 2
+    assert said in capsys.readouterr().err.replace("\n", " ")
+    assert not list(tmp_path.iterdir())
+
+
+def test_absent_weights(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert command.main([f"planner.weights={tmp_path}/none", f"output={tmp_path}"]) == 1
+    assert "train.py" in capsys.readouterr().err
+
+
+def test_an_experiment_without_runs_prints_the_papers_rows(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert command.main(["experiment=main_table", f"output={tmp_path}"]) == 0
+    assert "63.16" in capsys.readouterr().out

@@ -1,0 +1,120 @@
+"""Replies, the random planner, the registry, and models that stay apart from what they must not see."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from configs.compose import CONFIG_DIR
+from configs.schema.eval import PlannerConfig
+from configs.validate import build
+from data.records import ACTIONS, Camera, Observation, PlanStep, Proprioception
+from proprio_mllm.planners.protocol import Planner, TaskInfo, WeightsError, check_weights, parse_reply
+from proprio_mllm.planners.random_planner import RandomPlanner
+from proprio_mllm.planners.registry import PLANNERS, make_planner
+
+INFO = TaskInfo("pick up the mug", "h1", 9)
+
+
+def observation(visible: tuple[str, ...] = ("Mug_1",), known: tuple[str, ...] = ("Mug_1", "Fridge_1")) -> Observation:
+    body = Proprioception(np.zeros((64, 48), np.float32), 20.0, np.zeros(3), np.zeros((14, 3)))
+    camera = Camera(np.eye(3), np.eye(4), 112, 112)
+    return Observation("pick up the mug", "h1", np.zeros((112, 112, 3), np.uint8), camera, visible, known, body, (), 0, 9)
+
+
+def test_parse_reply_reads_the_first_line() -> None:
+    reply = parse_reply("\n Pick(left, Mug_1) & Open(right, Fridge_1) \nbecause", 7, 0.5)
+    assert reply.step == PlanStep.parse("Pick(left, Mug_1) & Open(right, Fridge_1)")
+    assert (reply.tokens, reply.latency_s, reply.error) == (7, 0.5, "")
+
+
+@pytest.mark.parametrize("text", ["", "pick the mug", "Pick(left, Mug_1); Done()", "Jump()"])
+def test_parse_reply_keeps_what_it_cannot_read(text: str) -> None:
+    reply = parse_reply(text)
+    assert reply.step is None
+    assert reply.text == text
+    assert reply.error
+
+
+def test_random_steps_are_legal_and_use_known_names() -> None:
+    planner = RandomPlanner()
+    planner.reset(INFO, np.random.default_rng(0))
+    names: set[str] = set()
+    for _ in range(400):
+        reply = planner.step(observation(), None)
+        assert reply.step is not None
+        assert PlanStep.parse(reply.step.to_text()).to_text() == reply.step.to_text()
+        for action in reply.step.actions:
+            names.add(action.name)
+            allowed = {"GoTo": ("Mug_1", "Fridge_1")}.get(action.name, ("Mug_1",))
+            assert action.object_id is None or action.object_id in allowed
+    assert names == set(ACTIONS) - {"Done"}
+
+
+def test_random_depends_on_the_generator_only() -> None:
+    def texts(seed: int) -> list[str]:
+        planner = RandomPlanner()
+        planner.reset(INFO, np.random.default_rng(seed))
+        return [planner.step(observation(), None).text for _ in range(20)]
+
+    assert texts(1) == texts(1)
+    assert texts(1) != texts(2)
+
+
+def test_random_without_any_name_moves_only() -> None:
+    planner = RandomPlanner()
+    planner.reset(INFO, np.random.default_rng(0))
+    for _ in range(50):
+        reply = planner.step(observation((), ()), None)
+        assert reply.step is not None
+        assert all(action.object_id is None for action in reply.step.actions)
+
+
+def test_every_configured_planner_is_made_somewhere() -> None:
+    kinds = set()
+    for path in sorted((CONFIG_DIR / "planner").glob("*.yaml")):
+        cfg = build(PlannerConfig, yaml.safe_load(path.read_text()))
+        assert cfg.name == path.stem
+        kinds.add(cfg.kind)
+    assert kinds == {*PLANNERS, "expert"}
+
+
+def test_registry() -> None:
+    assert isinstance(make_planner(PlannerConfig("r", "random", "R", image_size=56)), Planner)
+    with pytest.raises(ValueError, match=r"'expert' is not made here; allowed: mllm, random"):
+        make_planner(PlannerConfig("e", "expert", "E"))
+
+
+def test_weights_are_checked(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"nothing.*make them with `python train\.py`"):
+        check_weights(tmp_path / "nothing", "python train.py")
+    (tmp_path / "config.json").write_text("{}")
+    assert check_weights(tmp_path, "") == tmp_path
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "mllm"}, "weights None"),
+        ({"temperature": -1.0}, "temperature -1.0"),
+        ({"max_new_tokens": 0}, "max_new_tokens 0"),
+        ({"name": "a b"}, "'a b'"),
+        ({"weights": "x"}, "weights 'x'"),
+    ],
+)
+def test_config_refuses(change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build(PlannerConfig, {"name": "p", "kind": "random", "label": "P"} | change)
+
+
+def test_planners_never_import_the_simulator() -> None:
+    folder = Path(__file__).parents[2] / "proprio_mllm" / "planners"
+    for path in folder.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            assert not any(name.split(".")[0] in ("sim", "mujoco") or "evaluation" in name for name in names), path
