@@ -84,6 +84,7 @@ class NavigationMap:
     _clearance: NDArray[np.float64] = field(init=False, repr=False)
     _graph: csr_matrix = field(init=False, repr=False)
     _free: NDArray[np.bool_] = field(init=False, repr=False)
+    _boxes: NDArray[np.float64] = field(init=False, repr=False)
     _free_cells: NDArray[np.int64] = field(init=False, repr=False)
     _free_points: NDArray[np.float64] = field(init=False, repr=False)
     _shape: tuple[int, int] = field(init=False, repr=False)
@@ -94,6 +95,9 @@ class NavigationMap:
             raise ValueError(f"bounds must be (x_min, y_min, x_max, y_max) with max > min, got {self.bounds}")
         if self.radius_m <= 0.0:
             raise ValueError(f"radius_m must be positive, got {self.radius_m}")
+        self._boxes = np.array(
+            [(*r.center, *r.half, np.cos(r.yaw_rad), np.sin(r.yaw_rad)) for r in self.obstacles]
+        ).reshape(-1, 6)
         columns = int(np.floor((x1 - x0) / _RESOLUTION_M)) + 1
         rows = int(np.floor((y1 - y0) / _RESOLUTION_M)) + 1
         self._shape = (rows, columns)
@@ -109,11 +113,14 @@ class NavigationMap:
     def clearance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N,) metres between the robot's disc at (N, 2) points and the nearest obstacle or room edge, negative inside."""
         x0, y0, x1, y1 = self.bounds
-        distance = np.min(
-            np.stack([points[:, 0] - x0, x1 - points[:, 0], points[:, 1] - y0, y1 - points[:, 1]]), axis=0
-        )
-        for rectangle in self.obstacles:
-            distance = np.minimum(distance, rectangle.distance(points))
+        x, y = points[:, 0], points[:, 1]
+        distance = np.minimum(np.minimum(x - x0, x1 - x), np.minimum(y - y0, y1 - y))
+        if len(self.obstacles):
+            boxes = self._boxes  # (B, 6)
+            dx, dy = x[:, None] - boxes[:, 0], y[:, None] - boxes[:, 1]  # (N, B)
+            u = np.maximum(np.abs(boxes[:, 4] * dx + boxes[:, 5] * dy) - boxes[:, 2], 0.0)
+            v = np.maximum(np.abs(boxes[:, 4] * dy - boxes[:, 5] * dx) - boxes[:, 3], 0.0)
+            distance = np.minimum(distance, np.sqrt(np.min(u * u + v * v, axis=1)))
         return distance - self.radius_m
 
     def is_free(self, position: NDArray[np.float64]) -> bool:
@@ -178,9 +185,15 @@ class NavigationMap:
         """(N, 2) centres of all free grid cells."""
         return self._free_points.copy()
 
-    def cell_of(self, position: NDArray[np.float64]) -> int | None:
-        """The free grid cell next to a free position."""
-        return self._nearest_free_cell(position, limit_m=1.5 * _RESOLUTION_M) if self.is_free(position) else None
+    def cells_of(self, positions: NDArray[np.float64]) -> NDArray[np.int64]:
+        """(N,) grid cells next to positions (N, 2): of the four around each the one with most clearance."""
+        rows, columns = self._shape
+        exact = (positions - self.bounds[:2]) / _RESOLUTION_M  # (N, 2), column then row
+        low = np.floor(exact).astype(np.int64)
+        corners = np.stack([low, low + (1, 0), low + (0, 1), low + (1, 1)], axis=1)  # (N, 4, 2)
+        index = np.clip(corners[..., 1], 0, rows - 1) * columns + np.clip(corners[..., 0], 0, columns - 1)
+        best = np.argmax(self._clearance[index], axis=1)
+        return index[np.arange(len(index)), best]
 
     def points(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
         rows, columns = np.divmod(cells, self._shape[1])
@@ -244,18 +257,18 @@ class Ways:
     distance: NDArray[np.float64]
     previous: NDArray[np.int64]
 
-    def cost_m(self, goal: NDArray[np.float64]) -> float:
-        """Cost of the way to a position, infinite when there is none."""
-        cell = self.map.cell_of(goal)
-        return float("inf") if cell is None else float(self.distance[cell])
+    def costs_m(self, goals: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N,) costs of the ways to free positions (N, 2), infinite where there is none."""
+        return self.distance[self.map.cells_of(goals)]
 
     def to(self, goal: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Polyline (N >= 2, 2) to a position, None when there is none."""
-        cell = self.map.cell_of(goal)
-        if cell is None or not np.isfinite(self.distance[cell]):
+        goal = np.asarray(goal, dtype=np.float64)
+        cell = int(self.map.cells_of(goal[None])[0])
+        if not self.map.is_free(goal) or not np.isfinite(self.distance[cell]):
             return None
         cells = [cell]
         while cells[-1] != self.source:
             cells.append(int(self.previous[cells[-1]]))
         middle = self.map.points(np.array(cells[::-1]))
-        return self.map.shorten(np.concatenate([self.start[None], middle, np.asarray(goal)[None]]))
+        return self.map.shorten(np.concatenate([self.start[None], middle, goal[None]]))

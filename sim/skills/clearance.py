@@ -6,6 +6,7 @@ The hand's distance to an object is measured in the world itself, because the gr
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import mujoco
@@ -26,6 +27,26 @@ Array = NDArray[np.float64]
 TOUCH_M: Final = 0.008
 #: Distance beyond which finger gaps are not measured.
 _FAR_M: Final = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class _Cargo:
+    """A held object that moves with the hand: pose in the grasp site's frame, address of its free joint, its geoms."""
+
+    site: int
+    qpos_adr: int
+    offset: Array
+    turn: Array
+    geoms: frozenset[int]
+
+    def follow(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Puts the object of a copy of the state where the hand has it."""
+        rotation = data.site_xmat[self.site].reshape(3, 3)
+        data.qpos[self.qpos_adr : self.qpos_adr + 3] = data.site_xpos[self.site] + rotation @ self.offset
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, (rotation @ self.turn).ravel())
+        data.qpos[self.qpos_adr + 3 : self.qpos_adr + 7] = quaternion
+        mujoco.mj_kinematics(model, data)
 
 
 class ClearanceProbe:
@@ -78,11 +99,16 @@ class ClearanceProbe:
         scratch.qpos[:] = world.data.qpos
         if opening is not None:
             self._shape_hand(arm, opening)
-        mine = self._geoms[arm]
+        mine = set(self._geoms[arm])
+        cargo = self._cargo(arm)
+        if cargo is not None:
+            mine.update(cargo.geoms)
         depths: list[float] = []
         for posture in postures:
             scratch.qpos[self._arm_adr[arm]] = posture
             mujoco.mj_kinematics(model, scratch)
+            if cargo is not None:
+                cargo.follow(model, scratch)
             mujoco.mj_collision(model, scratch)
             count = int(scratch.ncon)
             worst = 0.0
@@ -94,6 +120,19 @@ class ClearanceProbe:
                     worst = float(deep)
             depths.append(worst)
         return np.array(depths)
+
+    def _cargo(self, arm: Arm) -> _Cargo | None:
+        """What the arm alone holds, as it lies in the hand now."""
+        world = self._world
+        name = world.held(arm.value)
+        thing = None if name is None else world.objects[name]
+        if thing is None or not thing.movable or len(thing.held_by) != 1:
+            return None
+        site = int(world.model.site(self._body.spec.arms[arm.value].grasp_site).id)
+        rotation = world.data.site_xmat[site].reshape(3, 3)
+        offset = rotation.T @ (world.data.xpos[thing.body_id] - world.data.site_xpos[site])
+        turn = rotation.T @ world.data.xmat[thing.body_id].reshape(3, 3)
+        return _Cargo(site, thing.qpos_adr, offset, turn, frozenset(map(int, thing.geom_ids)))
 
     def free(
         self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str | int] = (), opening: float | None = None

@@ -158,7 +158,7 @@ def best_stance(
         rings = [[distance_m], [distance_m - 0.05, distance_m + 0.05]]
     else:
         low, high = comfort_m
-        rings = [list(np.arange(low, high + 1e-9, 0.05)), list(np.arange(high + 0.05, 2.0, 0.05))]
+        rings = [list(np.arange(low, high + 1e-9, 0.025)), list(np.arange(high + 0.05, 2.0, 0.05))]
     ways = navigation.ways(start.position)
     middle = distance_m if distance_m is not None else 0.5 * (comfort_m[0] + comfort_m[1])
     for ring in rings:
@@ -166,8 +166,8 @@ def best_stance(
         if not stances:
             continue
         best: tuple[float, Stance] | None = None
-        for stance in stances:
-            way_m = ways.cost_m(stance.position)
+        costs = ways.costs_m(np.stack([stance.position for stance in stances]))
+        for stance, way_m in zip(stances, map(float, costs), strict=True):
             off = abs(float(np.linalg.norm(stance.position - target)) - middle)
             turn = abs(wrap_angle(stance.yaw_rad - start.yaw_rad))
             cost = way_m + _DISTANCE_WEIGHT * off + 0.1 * turn

@@ -20,6 +20,8 @@ __all__ = ["navigation_map", "obstacle_rectangles"]
 #: Geoms whose lowest point is above this are passed under, and those below the ankle are stepped over.
 _HEAD_M: Final = 1.9
 _STEP_M: Final = 0.03
+#: Movable objects that start higher lie on furniture, which is an obstacle already.
+_LYING_M: Final = 0.3
 _ROUND_M: Final = 0.01
 
 
@@ -39,6 +41,8 @@ def obstacle_rectangles(world: World) -> tuple[Rectangle, ...]:
         center = data.geom_xpos[geom] + rotation @ model.geom_aabb[geom, :3]
         half = model.geom_aabb[geom, 3:]
         rise = float(np.abs(rotation[2]) @ half)
+        if bits == MOVABLE_BITS[0] and center[2] - rise > _LYING_M:
+            continue
         if center[2] - rise > _HEAD_M or center[2] + rise < _STEP_M or center[1] > world.room.bounds[3] + 1.0:
             continue
         found.add(_footprint(center, rotation, half))
