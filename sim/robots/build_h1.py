@@ -36,7 +36,9 @@ SERVOS = {
     "elbow": (150.0, 18.0),
     "hand_joint": (40.0, 6.0),
 }
-FINGER_SERVO = (2.0, 1.0)
+#: Finger and thumb servos. One thumb opposes four fingers, so it is the stronger: an object is clamped, not pushed away.
+FINGER_SERVO = (1.0, 0.5)
+THUMB_SERVO = (10.0, 1.5)
 
 
 def reduce_mesh(vertices: NDArray[np.float64], faces: NDArray[np.int64], target: int) -> trimesh.Trimesh:
@@ -187,7 +189,7 @@ def build_h1(menagerie: Path, table: Path, target: Path) -> None:
         if servo is None:
             tune_joint(joint, armature=0.001, damping=0.05)
             if joint.name not in coupled:
-                add_servo(spec, joint, *FINGER_SERVO)
+                add_servo(spec, joint, *(THUMB_SERVO if "thumb" in joint.name else FINGER_SERVO))
         else:
             armature = 0.02 if "hand" in joint.name else 0.1
             tune_joint(joint, armature, damping=2.0 * float(np.sqrt(servo[0] * armature)))
