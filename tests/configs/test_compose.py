@@ -14,12 +14,12 @@ from sim.contingency import load_contingency
 
 ROOTS = {"train": TrainConfig, "eval": EvalConfig}
 #: Which root a group belongs to; `contingency` is data that the simulator reads.
-GROUP_ROOT = {"model": "train", "budget": "train", "planner": "eval", "robot": "eval", "experiment": "eval"}
+GROUP_ROOT = {"model": "train", "budget": "train", "data": "train", "planner": "eval", "robot": "eval", "experiment": "eval"}
 ALL = sorted(path.relative_to(CONFIG_DIR) for path in CONFIG_DIR.rglob("*.yaml"))
 
 
 def test_count() -> None:
-    assert len(ALL) == 22, f"configs/ holds {len(ALL)} YAML files: {[str(path) for path in ALL]}"
+    assert len(ALL) == 24, f"configs/ holds {len(ALL)} YAML files: {[str(path) for path in ALL]}"
     assert set(groups()) == {*GROUP_ROOT, "contingency"}
 
 
