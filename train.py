@@ -12,7 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from configs.compose import compose
 from configs.schema.train import TrainConfig
@@ -40,7 +40,9 @@ def make_shards(cfg: TrainConfig) -> None:
     from proprio_mllm.training.paths import StagePaths
     from sim.collect import collect
 
-    for kind, count, part in (("views", cfg.collect.views, 240), ("demos", cfg.collect.episodes, 10)):
+    wanted: tuple[tuple[Literal["views", "demos"], int, int], ...]
+    wanted = (("views", cfg.collect.views, 240), ("demos", cfg.collect.episodes, 10))
+    for kind, count, part in wanted:
         out = StagePaths(cfg).shards(kind)
         shards = ShardConfig(
             kind=kind, out=str(out), count=count, seed=cfg.seed, image_size=cfg.model.image_size, part_size=part,

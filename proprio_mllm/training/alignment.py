@@ -27,7 +27,7 @@ from configs.schema.train import AlignmentConfig
 from proprio_mllm.model.batch import Batch, Collator, Example
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.prompts import described_motion, filled_motion, looking, made_motion
+from proprio_mllm.model.prompts import Style, described_motion, filled_motion, looking, made_motion
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views
 
@@ -58,7 +58,8 @@ class AlignmentData:
         self, model: ProprioMLLM, tokenizer: MotionTokenizer, clips: Clips, views: Views, demos: Demos, cfg: AlignmentConfig
     ) -> None:
         self.tokenizer, self.clips, self.views, self.demos = tokenizer, clips, views, demos
-        self._cfg, self._style, self._collator = cfg, model.cfg.prompt, Collator(model.processor, model.cfg)
+        self._cfg, self._collator = cfg, Collator(model.processor, model.cfg)
+        self._style: Style = model.cfg.prompt
         self._demo_tokens = demos.tokens(tokenizer)
         with_images = [i for i, images in enumerate(clips.reader.column("image_frames")) if images]
         self._pictured = np.intersect1d(np.asarray(with_images, dtype=np.int64), clips.split.train)
@@ -122,7 +123,7 @@ class AlignmentObjective:
 
     def batch(self, rng: np.random.Generator, size: int) -> tuple[Kind, Batch]:
         """A batch of one kind, drawn anew each step."""
-        others = tuple(kind for kind in self._kinds if kind != "plan")
+        others: tuple[Kind, ...] = tuple(kind for kind in self._kinds if kind != "plan")
         if "plan" in self._kinds and rng.random() < self._cfg.plan_share:
             kind: Kind = "plan"
         else:

@@ -17,8 +17,9 @@ import numpy as np
 
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import use_adapter
+from proprio_mllm.model.chat import Message
 from proprio_mllm.model.modeling import ProprioMLLM
-from proprio_mllm.model.prompts import answers, critic_prompt, plan_prompt, self_ask_prompt, with_answer
+from proprio_mllm.model.prompts import Style, answers, critic_prompt, plan_prompt, self_ask_prompt, with_answer
 from proprio_mllm.training.goals import Relabel, relabel, verbs_of
 from proprio_mllm.training.judging import LOG_LENGTH
 from proprio_mllm.training.rollouts import Rollout
@@ -90,7 +91,7 @@ class ModelJudge(Judge):
 
     def __init__(self, model: ProprioMLLM, collator: Collator, adapter: str = "critic", size: int = 16) -> None:
         self._model, self._collator, self._adapter, self._size = model, collator, adapter, size
-        self._style = model.cfg.prompt
+        self._style: Style = model.cfg.prompt
 
     def completed(self, queries: Sequence[tuple[Trajectory, int, str]]) -> list[bool]:
         """Greedy replies; anything but `yes` is no."""
@@ -141,29 +142,34 @@ class OracleJudge(Judge):
         return answers([name for name in (rollout.relations or {}).get(relation, ()) if name in known])
 
 
-def judge_prompt(t: Trajectory, at: int, goal: str, style: Literal["terse", "full"]) -> tuple:
+def judge_prompt(t: Trajectory, at: int, goal: str, style: Style) -> tuple[Message, ...]:
     """`critic_prompt` about a moment."""
     moment = t.rollout.moments[at]
     return critic_prompt(goal, moment.visible, t.rollout.history(at), t.motion[at], style, LOG_LENGTH)
 
 
-def ask_prompt(t: Trajectory, relation: str, style: Literal["terse", "full"]) -> tuple:
+def ask_prompt(t: Trajectory, relation: str, style: Style) -> tuple[Message, ...]:
     """`self_ask_prompt` about the end."""
     at = t.rollout.length
     return self_ask_prompt(relation, t.rollout.moments[at].visible, t.rollout.history(at), t.motion[at], style, LOG_LENGTH)
 
 
 def critic_examples(
-    trajectories: Sequence[Trajectory], judge: Judge, style: Literal["terse", "full"]
-) -> tuple[list[CriticExample], dict[tuple[str, str], Relabel]]:
+    trajectories: Sequence[Trajectory], judge: Judge, style: Style, goals: dict[tuple[str, str], Relabel]
+) -> list[CriticExample]:
     """Judges, asks itself and relabels.
+
+    Args:
+        trajectories: this round's.
+        judge: the critic.
+        style: of the prompts.
+        goals: receives the relabelled goals by (episode, goal).
 
     Returns:
         The critic's new examples: yes on the goals it accepts directly, yes on relabelled goals that it confirms, no on the
-        original goal of every other trajectory. And the relabelled goals by (episode, goal).
+        original goal of every other trajectory.
     """
     examples: list[CriticExample] = []
-    goals: dict[tuple[str, str], Relabel] = {}
 
     def add(kind: Literal["direct", "relabel", "negative"], t: Trajectory, goal: str, answer: str) -> None:
         end = t.rollout.length
@@ -184,7 +190,7 @@ def critic_examples(
         goals[rollout.episode, found.goal] = found
         if judge.completed([(t, rollout.length, found.goal)])[0]:
             add("relabel", t, found.goal, "yes")
-    return examples, goals
+    return examples
 
 
 def keep(
@@ -219,7 +225,7 @@ def keep(
     return kept
 
 
-def actor_examples(kept: Sequence[Kept], style: Literal["terse", "full"], last: int) -> list[Example]:
+def actor_examples(kept: Sequence[Kept], style: Style, last: int) -> list[Example]:
     """Planning examples of kept trajectories: every step that worked, and `Done()` once the goal holds."""
     examples: list[Example] = []
     for item in kept:

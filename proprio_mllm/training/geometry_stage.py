@@ -49,7 +49,10 @@ def _stack(views: Views, indices: Any) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def point_map_error(encoder: nn.Module, views: Views, limit: int = 200, far_m: float = 20.0) -> dict[str, float]:
-    """Median and mean distance (m) of predicted to true points on held-out views, and the median relative to the distance."""
+    """Median and mean distance (m) of predicted to true points on held-out views, and the median relative to the distance.
+
+    Without held-out views only their number, 0, is returned.
+    """
     errors, shares = [], []
     for start in range(0, min(limit, len(views.split.test)), 32):
         rgb, points = _stack(views, views.split.test[start : min(start + 32, limit)])
@@ -61,6 +64,8 @@ def point_map_error(encoder: nn.Module, views: Views, limit: int = 200, far_m: f
         distance = (predicted - truth).norm(dim=-1)[valid]
         errors.append(distance)
         shares.append(distance / truth.norm(dim=-1)[valid].clamp_min(1e-3))
+    if not errors:
+        return {"views": 0.0}
     error, share = torch.cat(errors), torch.cat(shares)
     return {
         "point_median_m": float(error.median()),

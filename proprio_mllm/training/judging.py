@@ -8,8 +8,8 @@ Shape letters: none.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 
@@ -105,5 +105,5 @@ def judge_example(demos: Demos, index: int, rng: np.random.Generator, motion: Se
     return Example(with_answer(prompt, answers(states[relation])), (demos.view(row),))
 
 
-def _history(row: dict) -> list[HistoryItem]:
+def _history(row: Mapping[str, Any]) -> list[HistoryItem]:
     return [HistoryItem(item["step"], item["feedback"]) for item in row["history"]]

@@ -72,6 +72,7 @@ class Pipeline:
         self.cfg = cfg
         self.paths = StagePaths(cfg)
         self._collect = collect_rollouts
+        self._taken: Metrics = {}  # steps of each run of the current stage: a time budget may end it early
 
     # ---- what a stage depends on --------------------------------------------------------------------------------------------
 
@@ -105,7 +106,8 @@ class Pipeline:
             return None
         folder.mkdir(parents=True, exist_ok=True)
         began = time.monotonic()
-        metrics = STAGES[name](self, folder, key)
+        self._taken.clear()
+        metrics = STAGES[name](self, folder, key) | self._taken
         metrics["seconds"] = round(time.monotonic() - began, 1)
         finish(folder, key, metrics)
         logger.info("%s: %s", name, ", ".join(f"{k} {v:.4g}" for k, v in metrics.items()))
@@ -116,7 +118,8 @@ class Pipeline:
         folder.mkdir(parents=True, exist_ok=True)
         writer = MetricWriter(folder, objective.name, self.cfg.logger, {"key": objective.key})
         try:
-            run_loop(objective, cfg, folder, self.cfg.seed, writer, self.cfg.resume)
+            result = run_loop(objective, cfg, folder, self.cfg.seed, writer, self.cfg.resume)
+            self._taken[f"{objective.name}/steps"] = float(result.steps)
         finally:
             writer.close()
 

@@ -36,6 +36,7 @@ from proprio_mllm.training.critic import (
     critic_examples,
     keep,
 )
+from proprio_mllm.training.goals import Relabel
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
@@ -184,17 +185,15 @@ class _Selu:
         trajectories = _trajectories(read_rollouts(request.folder), self.tokenizer)
         if not trajectories:
             raise ValueError(f"{request.folder}: the collector wrote no episode")
-        oracle = OracleJudge({})
-        judge: Judge = oracle if self.cfg.truth == "oracle" else ModelJudge(self.model, self.collator, CRITIC)
-        learnt, goals = critic_examples(trajectories, judge, style)
+        goals: dict[tuple[str, str], Relabel] = {}
+        judge: Judge = OracleJudge(goals) if self.cfg.truth == "oracle" else ModelJudge(self.model, self.collator, CRITIC)
         metrics: dict[str, float] = {f"before_{name}": value for name, value in audit(trajectories, {}, judge).items()}
+        learnt = critic_examples(trajectories, judge, style, goals)
         for kind in ("direct", "relabel", "negative"):
             metrics[f"critic_{kind}"] = float(sum(one.kind == kind for one in learnt))
         self.tune(
             CRITIC, "selu/critic", [one.example for one in learnt], self.cfg.critic, self.cfg.replay_share, folder / "critic"
         )
-        if self.cfg.truth == "oracle":
-            judge = OracleJudge(goals)
         kept = keep(trajectories, goals, judge, self.cfg.per_class)
         metrics |= {f"after_{name}": value for name, value in audit(trajectories, goals, judge).items()}
         steps = actor_examples(kept, style, last)

@@ -26,7 +26,7 @@ from data.shards import ShardReader, decode_depth, decode_motion, decode_png, de
 from proprio_mllm.model.batch import Example, View
 from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.prompts import answers, looking, plan_prompt, with_answer
+from proprio_mllm.model.prompts import Style, answers, looking, plan_prompt, with_answer
 from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
 
 __all__ = ["Clips", "Demos", "Views", "held_out", "shard_hash"]
@@ -145,7 +145,7 @@ class Demos:
         done = np.array([target == "Done()" for target in self.reader.column("target")], dtype=bool)
         #: Training rows whose expert step ends the episode.
         self.finals = np.intersect1d(np.flatnonzero(done), self.split.train)
-        self.style = cfg.prompt
+        self.style: Style = cfg.prompt
         self._cfg = cfg
 
     def tokens(self, tokenizer: MotionTokenizer) -> NDArray[np.int64]:

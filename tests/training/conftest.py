@@ -31,19 +31,10 @@ K = np.array([[60.0, 0, 56], [0, 60, 56], [0, 0, 1]])
 def motion_window(rng: np.random.Generator, frames: int = 64) -> NDArray[np.float32]:
     """A smooth window whose key bodies form a plausible body."""
     base = np.zeros(N_FEATURES, dtype=np.float32)
-    keys = np.array(
-        [[0, 0, 0.3], [0, 0, 0.7], [0, 0.2, 0.45], [0.1, 0.25, 0.2], [0.3, 0.25, 0.1], [0, -0.2, 0.45], [0.1, -0.25, 0.2]]
-        + [
-            [0.3, -0.25, 0.1],
-            [0, 0.1, 0],
-            [0.05, 0.1, -0.4],
-            [0, 0.1, -0.8],
-            [0, -0.1, 0],
-            [0.05, -0.1, -0.4],
-            [0, -0.1, -0.8],
-        ],
-        dtype=np.float32,
-    )
+    left = [[0, 0.2, 0.45], [0.1, 0.25, 0.2], [0.3, 0.25, 0.1]]
+    leg = [[0, 0.1, 0], [0.05, 0.1, -0.4], [0, 0.1, -0.8]]
+    mirror = np.array([1, -1, 1])
+    keys = np.concatenate([[[0, 0, 0.3], [0, 0, 0.7]], left, np.array(left) * mirror, leg, np.array(leg) * mirror])
     base[:42] = keys.ravel()
     base[42] = 0.95
     wave = np.sin(np.linspace(0, rng.uniform(1, 6), frames) + rng.uniform(0, 6))[:, None] * rng.normal(0, 0.03, N_FEATURES)
@@ -191,7 +182,7 @@ def one_thread() -> None:
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with `views`, `demos` and `clips`."""
     root = tmp_path_factory.mktemp("shards")
-    write_views(root / "views")
+    write_views(root / "views", 60)
     write_demos(root / "demos")
     write_clips(root / "clips")
     return root

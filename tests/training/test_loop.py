@@ -1,0 +1,139 @@
+"""The loop: schedule, budgets, and that a killed and resumed run ends with the same weights."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from configs.schema.train import LoggerConfig, LoopConfig
+from proprio_mllm.training.loop import learning_rate, run_loop
+from proprio_mllm.training.metrics import MetricWriter
+
+CFG = LoopConfig(steps=30, batch=8, lr=1e-2, warmup=3, checkpoint_every=4, log_every=5)
+
+
+class Line:
+    """Fits a line; the loss also draws, so that the generator's state matters."""
+
+    name = "line"
+
+    def __init__(self, key: str = "k", bad: bool = False) -> None:
+        torch.manual_seed(0)
+        self.module: nn.Module = nn.Sequential(nn.Linear(3, 8), nn.Tanh(), nn.Linear(8, 1))
+        self.key, self.bad, self.seen = key, bad, 0
+
+    def batch(self, rng: np.random.Generator, size: int) -> Tensor:
+        return torch.from_numpy(rng.normal(size=(size, 3)).astype(np.float32))
+
+    def loss(self, module: nn.Module, batch: Tensor, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
+        self.seen += 1
+        noise = torch.randn(len(batch), 1, generator=generator) * 0.1
+        loss = (module(batch) - batch.sum(1, keepdim=True) + noise).square().mean()
+        return loss * float("nan") if self.bad else loss, {"extra": 1.0}
+
+
+def weights(module: nn.Module) -> list[Tensor]:
+    return [tensor.clone() for tensor in module.state_dict().values()]
+
+
+def run(folder: Path, objective: Line, cfg: LoopConfig = CFG, seed: int = 5) -> list[Tensor]:
+    run_loop(objective, cfg, folder, seed, MetricWriter(folder, "line", LoggerConfig("disabled")))
+    return weights(objective.module)
+
+
+def test_same_seed_same_weights(tmp_path: Path) -> None:
+    first, second = run(tmp_path / "a", Line()), run(tmp_path / "b", Line())
+    assert all(torch.equal(x, y) for x, y in zip(first, second, strict=True))
+    other = run(tmp_path / "c", Line(), seed=6)
+    assert not all(torch.equal(x, y) for x, y in zip(first, other, strict=True))
+
+
+SCRIPT = """
+import sys, time
+from pathlib import Path
+import importlib.util
+spec = importlib.util.spec_from_file_location("test_loop", {file!r})
+module = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+class Slow(module.Line):
+    def loss(self, *args):
+        time.sleep(0.15)
+        return super().loss(*args)
+module.run(Path({folder!r}), Slow())
+"""
+
+
+def test_kill_and_resume_gives_the_same_weights(tmp_path: Path) -> None:
+    whole = run(tmp_path / "whole", Line())
+    folder = tmp_path / "killed"
+    script = textwrap.dedent(SCRIPT).format(file=__file__, folder=str(folder))
+    root = str(Path(__file__).parents[2])
+    process = subprocess.Popen([sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": root}, cwd=root)
+    state = folder / "checkpoint" / "state.json"
+    for _ in range(600):
+        if state.is_file():
+            break
+        torch.tensor(0).item()
+        __import__("time").sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert state.is_file()
+    objective = Line()
+    resumed = run(folder, objective)
+    assert 0 < objective.seen < CFG.steps
+    assert all(torch.equal(x, y) for x, y in zip(whole, resumed, strict=True))
+    rows = (folder / "metrics.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["step", *(str(s) for s in range(5, 31, 5))]
+
+
+def test_checkpoint_of_another_key_is_not_resumed(tmp_path: Path) -> None:
+    run(tmp_path, Line("one"))
+    again = Line("two")
+    run(tmp_path, again)
+    assert again.seen == CFG.steps
+    assert load_file(tmp_path / "checkpoint" / "model.safetensors")
+
+
+def test_time_budget_ends_a_run(tmp_path: Path) -> None:
+    objective = Line()
+    cfg = LoopConfig(steps=10_000, batch=2, lr=1e-3, minutes=0.01, log_every=100, checkpoint_every=1000)
+    result = run_loop(objective, cfg, tmp_path, 0, MetricWriter(tmp_path, "line", LoggerConfig("disabled")))
+    assert 0 < result.steps < cfg.steps
+    assert result.steps == objective.seen
+
+
+def test_learning_rate_warms_up_and_decays() -> None:
+    cfg = LoopConfig(steps=100, batch=1, lr=1.0, warmup=10, minutes=1.0)
+    assert learning_rate(cfg, 0) == pytest.approx(0.1)
+    assert learning_rate(cfg, 10) == pytest.approx(1.0)
+    assert learning_rate(cfg, 100) == pytest.approx(0.1)
+    assert learning_rate(cfg, 10, seconds=60.0) == pytest.approx(0.1)
+
+
+def test_loss_that_is_not_finite_stops(tmp_path: Path) -> None:
+    with pytest.raises(FloatingPointError, match="line: loss nan at step 0"):
+        run(tmp_path, Line(bad=True))
+
+
+def test_nothing_to_train(tmp_path: Path) -> None:
+    objective = Line()
+    objective.module.requires_grad_(False)
+    with pytest.raises(ValueError, match="'line' trains no parameter"):
+        run(tmp_path, objective)
+
+
+@pytest.mark.parametrize(("field", "value"), [("steps", 0), ("lr", 0.0), ("minutes", -1.0)])
+def test_loop_config_refuses(field: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{field} {value}"):
+        LoopConfig(**{"steps": 1, "batch": 1, "lr": 0.1, field: value})

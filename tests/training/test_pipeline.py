@@ -1,0 +1,219 @@
+"""All stages on small shards: they run, skip what is current, change only what they say, and hand on a usable model."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from configs.compose import compose
+from configs.schema.model import ModelConfig
+from configs.schema.train import TrainConfig
+from configs.validate import ConfigError, build
+from data.records import Camera, Observation, Proprioception
+from data.shards import ShardWriter
+from proprio_mllm.model.building import add_adapter, load_model
+from proprio_mllm.model.groups import train_only
+from proprio_mllm.training import release
+from proprio_mllm.training.alignment import PHASES, AlignmentObjective
+from proprio_mllm.training.pipeline import Pipeline, variant_model
+from proprio_mllm.training.rollouts import RolloutRequest, read_rollouts, rollout_row
+from proprio_mllm.training.selu import CRITIC, copy_adapter, train_adapter
+
+HELPERS = importlib.util.spec_from_file_location("training_helpers", Path(__file__).with_name("conftest.py"))
+assert HELPERS is not None
+assert HELPERS.loader is not None
+helpers = importlib.util.module_from_spec(HELPERS)
+HELPERS.loader.exec_module(helpers)
+POSE, K, motion_window, scene = helpers.POSE, helpers.K, helpers.motion_window, helpers.scene
+
+STEPS = (
+    ("GoTo(Mug_1)", "GoTo(Mug_1) ok", True),
+    ("Pick(left, Mug_1)", "Pick(left, Mug_1) ok", True),
+    ("Place(left, CoffeeTable_1)", "Place(left, CoffeeTable_1) ok", True),
+)
+
+
+def collect(request: RolloutRequest) -> None:
+    """Scripted episodes in place of the simulator: two tasks, of which the second is not what the robot did."""
+    rng = np.random.default_rng(request.seed)
+    ids = ("Mug_1", "Plate_1", "CoffeeTable_1")
+    rows = []
+    for number, text in enumerate(("Put the mug on the coffee table.", "Put the plate on the coffee table.")):
+        observations = []
+        steps = STEPS if number == 0 else (("MoveAhead(0.5)", "MoveAhead(0.5) ok", True), *STEPS)
+        for step in range(len(steps) + 1):
+            motion = motion_window(rng)
+            proprioception = Proprioception(motion, 20.0, np.zeros(3), motion[-1, :42].reshape(14, 3).astype(np.float64))
+            camera = Camera(K, POSE, 112, 112)
+            image = scene(rng)[0]
+            observations.append(Observation(text, "h1", image, camera, ids[:2], ids, proprioception, (), step, 8))
+        truth = {"on CoffeeTable_1": ["Mug_1"], "held": []}
+        keys = (f"e{number}", "t", "single", "kitchen_1", 1, "natural")
+        rows.append(rollout_row(*keys, observations, steps, number == 0, truth))
+    writer = ShardWriter(request.folder, "rollouts", request.config_hash, overwrite=True)
+    writer.write(0, rows)
+    writer.finish({})
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
+    """Every stage, run once."""
+    torch.set_num_threads(1)
+    root = tmp_path_factory.mktemp("run")
+    cfg = build(TrainConfig, compose("train", ["budget=debug", f"output={root}", "logger.wandb=disabled", "selu.truth=oracle"]))
+    small = dataclasses.replace(cfg, model=_small(cfg.model))
+    (root / "tiny").mkdir()
+    (root / "tiny" / "data").symlink_to(shards, target_is_directory=True)
+    pipeline = Pipeline(small, collect)
+    for stage in ("base", "pointmap", "tokenizer", "alignment", "selu"):
+        assert pipeline.run(stage) is not None
+    return pipeline
+
+
+def _small(model: ModelConfig) -> ModelConfig:
+    return dataclasses.replace(
+        model,
+        vocab_size=450,
+        text=dataclasses.replace(model.text, hidden=64, layers=2, heads=2, kv_heads=1, intermediate=96),
+        vision=dataclasses.replace(model.vision, hidden=32, depth=2, heads=2, intermediate=48),
+        point_map=dataclasses.replace(model.point_map, width=32, depth=1),
+        motion=dataclasses.replace(model.motion, codes=32, code_dim=16, width=16, depth=1),
+    )
+
+
+def test_current_stages_are_skipped_and_others_are_not(trained: Pipeline) -> None:
+    assert trained.run("base") is None
+    assert trained.run("selu") is None
+    longer = dataclasses.replace(trained.cfg.pointmap, steps=5)
+    changed = Pipeline(dataclasses.replace(trained.cfg, pointmap=longer), collect)
+    assert changed.key("base") == trained.key("base")
+    assert changed.key("pointmap") != trained.key("pointmap")
+    assert changed.key("alignment") != trained.key("alignment")
+
+
+def test_metrics_are_reported(trained: Pipeline) -> None:
+    def metrics(stage: str) -> dict[str, float]:
+        return json.loads((trained.paths.stage(stage) / "done.json").read_text())["metrics"]
+
+    assert {"side_accuracy", "side_majority", "plan_exact", "base/joint/steps"} <= set(metrics("base"))
+    assert metrics("pointmap")["point_median_m"] > 0.0
+    assert {"clips_mpjpe_mm", "clips_hands_feet_mm", "codes_used", "perplexity"} <= set(metrics("tokenizer"))
+    assert {"arm_accuracy", "shift_accuracy", "plan_exact"} <= set(metrics("alignment"))
+
+
+def test_oracle_selu_keeps_the_success_and_relabels_the_failure(trained: Pipeline) -> None:
+    metrics = json.loads((trained.paths.stage("selu") / "done.json").read_text())["metrics"]
+    assert metrics["round0_critic_direct"] == 1.0
+    assert metrics["round0_critic_negative"] == 1.0
+    assert metrics["round0_after_precision"] == 1.0
+    # The oracle accepts both: the success as it is, and the failure under what the robot did instead.
+    assert metrics["round0_kept"] == 2.0
+    assert metrics["round0_kept_relabelled"] == 1.0
+
+
+def test_every_model_loads(trained: Pipeline) -> None:
+    for stage, proprioception in (("base", False), ("alignment", True), ("selu", True)):
+        model = load_model(trained.paths.model(stage))
+        assert model.cfg.proprioception is proprioception
+        assert model.cfg.weights is None
+        assert (model.cse is not None) is proprioception
+
+
+@pytest.mark.parametrize("phase", list(PHASES))
+def test_a_phase_changes_only_its_groups(trained: Pipeline, phase: str) -> None:
+    from proprio_mllm.model.groups import group_of
+    from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+    from proprio_mllm.training.alignment import AlignmentData
+    from proprio_mllm.training.sources import Clips, Demos, Views
+
+    model = trained._start_alignment()
+    shards, cfg = trained.paths.shards, trained.cfg.alignment
+    tokenizer = MotionTokenizer.load(trained.paths.model("tokenizer"))
+    views, demos = Views(shards("views"), model.cfg), Demos(shards("demos"), model.cfg)
+    data = AlignmentData(model, tokenizer, Clips(shards("clips")), views, demos, cfg)
+    train_only(model, PHASES[phase].groups)
+    before = {name: tensor.detach().clone() for name, tensor in model.named_parameters()}
+    trained.loop(AlignmentObjective(model, data, phase, cfg, "test"), cfg.joint, trained.paths.root / f"groups-{phase}")
+    changed = {group_of(name) for name, tensor in model.named_parameters() if not torch.equal(tensor, before[name])}
+    assert changed <= set(PHASES[phase].groups)
+    assert "rows" in changed
+
+
+def test_adapters_train_apart(trained: Pipeline) -> None:
+    model = load_model(trained.paths.model("alignment"), trainable=True)
+    add_adapter(model, CRITIC)
+    copy_adapter(model, "default", CRITIC)
+    state = dict(model.named_parameters())
+    pairs = [(name, name.replace(".default", f".{CRITIC}")) for name in state if ".default" in name]
+    assert pairs
+    assert all(torch.equal(state[a], state[b]) for a, b in pairs)
+    chosen = train_adapter(model, CRITIC)
+    assert chosen
+    names = [name for name, parameter in model.named_parameters() if parameter.requires_grad]
+    assert all(f".{CRITIC}" in name for name in names)
+    with pytest.raises(ValueError, match="no weights of adapter 'ghost'"):
+        copy_adapter(model, "ghost", CRITIC)
+
+
+def test_variants() -> None:
+    model = build(TrainConfig, compose("train", [])).model
+    assert variant_model(model, "full") == model
+    assert variant_model(model, "no_mpe").mpe.mode == "mrope"
+    assert variant_model(model, "no_mpe").cse.enabled
+    assert not variant_model(model, "no_mpe_cse").cse.enabled
+    with pytest.raises(ValueError, match="variant 'half'; allowed: full, no_mpe, no_cse, no_mpe_cse"):
+        variant_model(model, "half")
+
+
+def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = release.export(trained, tmp_path, "python train.py stage=all")
+    assert [folder.name for folder in written] == ["base", "full-alignment", "full"]
+    about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
+    assert about["command"] == "python train.py stage=all"
+    assert set(about["shards"]) == {"clips", "views", "demos"}
+    load_model(tmp_path / "tiny" / "full")
+    assert release.find_model("nowhere", tmp_path, "tiny", "full", "selu") == tmp_path / "tiny" / "full"
+    assert release.find_model(trained.cfg.output, tmp_path, "tiny", "full", "selu") == trained.paths.model("selu")
+    with pytest.raises(FileNotFoundError, match="no selu model of tiny \\(no_cse\\)"):
+        release.find_model("nowhere", tmp_path, "tiny", "no_cse", "selu")
+    monkeypatch.setattr(release, "LARGEST_MB", 0.001)
+    with pytest.raises(ValueError, match=r"at most 0.001 MB are released"):
+        release.export(trained, tmp_path, "x")
+
+
+def test_rollouts_refuse_the_benchmark(tmp_path: Path) -> None:
+    request = RolloutRequest(tmp_path, tmp_path / "r", 2, 0, 0.7, "h")
+    collect(request)
+    rollouts = read_rollouts(request.folder)
+    assert rollouts[0].receptacles() == ["CoffeeTable_1"]
+    assert rollouts[0].view(3).image.shape == (112, 112, 3)
+    with pytest.raises(ValueError, match="3 steps need 4 observations, got 0"):
+        rollout_row("e", "t", "single", "k", 0, "easy", [], STEPS, True)
+    row = {**rollouts[0].row, "split": "benchmark"}
+    writer = ShardWriter(tmp_path / "leak", "rollouts", "h")
+    writer.write(0, [row])
+    writer.finish({})
+    with pytest.raises(ValueError, match="'e0' is of the benchmark"):
+        read_rollouts(tmp_path / "leak")
+
+
+@pytest.mark.parametrize("budget", ["cpu", "debug", "gpu"])
+@pytest.mark.parametrize("model", ["tiny", "qwen2_5_vl_7b"])
+def test_configurations_compose(budget: str, model: str) -> None:
+    cfg = build(TrainConfig, compose("train", [f"budget={budget}", f"model={model}"]))
+    assert cfg.model.name == model
+    assert cfg.logger.wandb in ("offline", "disabled")
+
+
+@pytest.mark.parametrize(
+    ("override", "message"), [("stage=foo", "selu"), ("selu.truth=maybe", "oracle"), ("base.stpes=1", "joint")]
+)
+def test_wrong_overrides_name_what_is_allowed(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        build(TrainConfig, compose("train", [override]))
