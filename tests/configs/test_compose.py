@@ -15,6 +15,8 @@ from sim.contingency import load_contingency
 ROOTS = {"train": TrainConfig, "eval": EvalConfig}
 #: Which root a group belongs to; `contingency` is data that the simulator reads.
 GROUP_ROOT = {"model": "train", "budget": "train", "data": "train", "planner": "eval", "robot": "eval", "experiment": "eval"}
+#: What a user must add to a configuration that has no default for it.
+NEEDS = {"humanml3d": ("data.path=HumanML3D",)}
 ALL = sorted(path.relative_to(CONFIG_DIR) for path in CONFIG_DIR.rglob("*.yaml"))
 
 
@@ -33,7 +35,7 @@ def test_every_yaml_composes(path: Path) -> None:
         load_contingency(name)
         return
     root = GROUP_ROOT[group]
-    build(ROOTS[root], compose(root, [f"{group}={name}"]))
+    build(ROOTS[root], compose(root, [f"{group}={name}", *NEEDS.get(name, ())]))
 
 
 @pytest.mark.parametrize(
