@@ -148,6 +148,8 @@ def build_h1(menagerie: Path, table: Path, target: Path) -> None:
     spec.body("pelvis").pos = [0.0, 0.0, 1.044]
     for geom in spec.geoms:  # trunk and legs never collide, see build_common
         geom.contype, geom.conaffinity = 0, 0
+        if geom.meshname == "logo_link":  # in front of the reduced chest, which is not exactly flat
+            geom.pos = np.asarray(geom.pos) + np.array([0.004, 0.0, 0.0])
     bodies = {body.name: body for body in spec.bodies}
     rows = {
         row.link: row
