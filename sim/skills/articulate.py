@@ -24,7 +24,7 @@ from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
 from sim.skills.grasps import hand_shape
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
-from sim.skills.reach import Reach, out_of_reach, plan_reach
+from sim.skills.reach import Reach, blame, plan_reach
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.trajectory import min_jerk
@@ -96,22 +96,26 @@ def assess_open_close(body: Body, action: Action) -> Pull:
     goal = low + _OPEN_TO * (high - low) if opening else low
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
     grip_m = hand_shape(body.spec.name).tip_m - 0.025  # the fingertips reach a little past the bar
-    tried = 0
-    for pointing in _pointings(body, arm, handle):
-        wish = HandPose(handle - grip_m * pointing, pointing)
-        reach = plan_reach(body, arm, wish, -pointing, 0.08, bar, pointing=0.7)
-        if reach is None:
-            continue
-        tried += 1
-        pull = _plan_pull(body, arm, part, reach, wish.position, goal, opening)
-        if pull is not None:
-            return pull
-        if tried > 8:
-            break
-    failure = out_of_reach(body, arm, handle)
-    if failure is not None:
-        raise failure
-    raise SkillFailure(FailureCode.OBSTRUCTED, {"gap_m": 0.0})
+
+    def search() -> Pull:
+        tried = 0
+        for pointing in _pointings(body, arm, handle):
+            wish = HandPose(handle - grip_m * pointing, pointing)
+            reach = plan_reach(body, arm, wish, -pointing, 0.08, bar, pointing=0.7)
+            if reach is None:
+                continue
+            tried += 1
+            pull = _plan_pull(body, arm, part, reach, wish.position, goal, opening)
+            if pull is not None:
+                return pull
+            if tried > 8:
+                break
+        raise SkillFailure(FailureCode.OBSTRUCTED)
+
+    try:
+        return search()
+    except SkillFailure:
+        raise blame(body, {arm: handle}, search) from None
 
 
 def _plan_pull(
@@ -225,15 +229,19 @@ def assess_toggle(body: Body, action: Action) -> Reach:
     check_toggle(body, arm, thing, action.name == "ToggleOn")
     switch = body.world.toggle_point(thing.object_id)
     tip = hand_shape(body.spec.name).tip_m
-    for pointing in _pointings(body, arm, switch):
-        wish = HandPose(switch - (tip - 0.006) * pointing, pointing)
-        reach = plan_reach(body, arm, wish, -pointing, 0.07, (thing.object_id,), pointing=0.85)
-        if reach is not None:
-            return reach
-    failure = out_of_reach(body, arm, switch)
-    if failure is not None:
-        raise failure
-    raise SkillFailure(FailureCode.OBSTRUCTED, {"gap_m": 0.0})
+
+    def search() -> Reach:
+        for pointing in _pointings(body, arm, switch):
+            wish = HandPose(switch - (tip - 0.006) * pointing, pointing)
+            reach = plan_reach(body, arm, wish, -pointing, 0.07, (thing.object_id,), pointing=0.85)
+            if reach is not None:
+                return reach
+        raise SkillFailure(FailureCode.OBSTRUCTED)
+
+    try:
+        return search()
+    except SkillFailure:
+        raise blame(body, {arm: switch}, search) from None
 
 
 def toggle(body: Body, action: Action, luck: Luck) -> Skill:

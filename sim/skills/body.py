@@ -11,7 +11,8 @@ Frames: `world`; `pelvis` is the pelvis heading frame.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -39,8 +40,10 @@ __all__ = ["ArmGoal", "Body", "BothGoal", "ready_posture", "wait"]
 
 Array = NDArray[np.float64]
 
-ARM_SPEED_RAD_S: Final = 3.5
-ARM_ACCELERATION_RAD_S2: Final = 16.0
+ARM_SPEED_RAD_S: Final = 3.8
+ARM_ACCELERATION_RAD_S2: Final = 20.0
+#: Height of the highest surfaces that a robot walks up to with a load, with some room below the load.
+_WORKTOP_M: Final = 0.97
 HAND_SECONDS: Final = 0.35
 #: Position error of an arm posture that still counts as reaching.
 REACH_TOLERANCE_M: Final = 0.012
@@ -56,12 +59,15 @@ class ArmGoal:
         q: (A,) arm joints.
         error_m: distance of the grasp site from the wish.
         pointing_cos, closing_cos: how well the hand's axes agree with the wish, 1 where it left them open.
+        pointing, closing: (3,) directions that the hand has then, world frame.
     """
 
     q: Array
     error_m: float
     pointing_cos: float
     closing_cos: float
+    pointing: Array
+    closing: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +110,7 @@ class Body:
         self._hand_ids = {arm: np.array([self._actuators[name] for name in self.spec.arms[arm.value].hand_joints]) for arm in Arm}
         self._waist_ids = np.array([self._actuators[name] for name in self.spec.waist_joints])
         self._columns = {arm: kit.model.indices(self.spec.arms[arm.value].joints) for arm in Arm}
+        self.considered_height_m: float | None = None
         self._vias: dict[Arm, tuple[Array, ...]] = {}
         self.probe = ClearanceProbe(world, self)
 
@@ -121,8 +128,18 @@ class Body:
 
     @property
     def pelvis_height_m(self) -> float:
-        """Commanded pelvis height."""
-        return float(self.world.data.ctrl[self._base[2]])
+        """Commanded pelvis height, or the one that is being considered."""
+        return self.considered_height_m if self.considered_height_m is not None else float(self.world.data.ctrl[self._base[2]])
+
+    @contextmanager
+    def considering(self, pelvis_height_m: float) -> Iterator[None]:
+        """Within the block every geometric answer is for another pelvis height; nothing moves."""
+        before = self.considered_height_m
+        self.considered_height_m = pelvis_height_m
+        try:
+            yield
+        finally:
+            self.considered_height_m = before
 
     def base_error_m(self) -> float:
         """Distance between commanded and actual base, the heading weighed with 0.3 m per radian."""
@@ -319,6 +336,14 @@ class Body:
         """(A,) posture between actions: hand before the shoulder, fingers level ahead, above tables and beside the camera's view."""
         return ready_posture(self.spec.name, arm)
 
+    def carrying(self, arm: Arm) -> Array:
+        """(A,) posture in which a hand carries something: the ready one, or higher and closer on robots with low shoulders.
+
+        A load before a hand that is lower than a worktop would run into its front when the robot steps up to it.
+        """
+        ready_m = self.spec.standing_pelvis_height_m + float(self.maps[arm.value].shoulder[2]) - 0.3 * self.maps[arm.value].reach_m
+        return ready_posture(self.spec.name, arm, raised=ready_m < _WORKTOP_M)
+
     def solve(
         self,
         arm: Arm,
@@ -380,6 +405,8 @@ class Body:
                 result.position_error_m,
                 pointing,
                 abs(along) if local.either_way else along,
+                self.turn_to_world(reached[:, 0]),
+                self.turn_to_world(reached[:, 1]),
             )
             cost = 20.0 * max(goal.error_m - 0.5 * REACH_TOLERANCE_M, 0.0) + 2.0 - goal.pointing_cos - goal.closing_cos
             if best is None or cost < best[0]:
@@ -413,16 +440,14 @@ class Body:
         arms = {arm: result.q[self._columns[arm]].copy() for arm in Arm}
         return BothGoal(arms, result.q[waist].copy(), result.position_error_m, result.rotation_error_rad)
 
-    def heights_in_reach(self, arm: Arm, point: Array) -> list[float]:
-        """Pelvis heights, of a grid over the robot's range, at which the arm would reach a world point from this stance."""
+    def heights(self) -> list[float]:
+        """A grid over the robot's pelvis heights, metres."""
         low, high = self.spec.pelvis_height_range_m
-        heights = np.linspace(low, high, max(2, int(np.ceil((high - low) / _HEIGHT_STEP_M)) + 1))
-        reach_map = self.maps[arm.value]
-        good: list[float] = []
-        for height in heights:
-            if reach_map.contains(self.in_trunk(point, float(height))):
-                good.append(float(height))
-        return good
+        return [float(h) for h in np.linspace(low, high, max(2, int(np.ceil((high - low) / _HEIGHT_STEP_M)) + 1))]
+
+    def within(self, arm: Arm, point: Array, pelvis_height_m: float) -> bool:
+        """Whether a world point is within the arm's envelope at a pelvis height, from this stance."""
+        return self.maps[arm.value].contains(self.in_trunk(point, pelvis_height_m))
 
     def vias(self, arm: Arm) -> tuple[Array, ...]:
         """(A,) postures that lead around furniture edges: the ready one, and the hand forward at shoulder height."""
@@ -435,15 +460,16 @@ class Body:
     # ---- motions
 
     def move_arm(self, arm: Arm, waypoints: Sequence[Array], speed: float = 1.0) -> Skill:
-        """Moves the arm from its commanded posture through (A,) waypoints, at rest at the end; `speed` scales the bounds."""
+        """Moves the arm from its commanded posture straight to one (A,) waypoint after the other; `speed` scales the bounds."""
         ids = self._arm_ids[arm]
-        points = np.stack([self.world.data.ctrl[ids].copy(), *waypoints])
-        way = plan(points, ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed * speed)
-        time_s = 0.0
-        while time_s < way.duration_s:
-            time_s += CONTROL_DT_S
-            self.world.data.ctrl[ids] = way.at(time_s)
-            yield
+        for goal in waypoints:
+            ends = np.stack([self.world.data.ctrl[ids].copy(), goal])
+            way = plan(ends, ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed * speed)
+            time_s = 0.0
+            while time_s < way.duration_s:
+                time_s += CONTROL_DT_S
+                self.world.data.ctrl[ids] = way.at(time_s)
+                yield
 
     def command_arm(self, arm: Arm, q: Array) -> None:
         """Sets the arm joints' targets."""
@@ -458,15 +484,17 @@ class Body:
         return self.world.data.ctrl[self._waist_ids].copy()
 
     def move_both(self, goals: Sequence[BothGoal], speed: float = 1.0) -> Skill:
-        """Moves both arms and the waist together through goals, at rest at the end."""
+        """Moves both arms and the waist together straight to one goal after the other."""
         ids = np.concatenate([self._arm_ids[Arm.LEFT], self._arm_ids[Arm.RIGHT], self._waist_ids])
-        rows = [np.concatenate([goal.arms[Arm.LEFT], goal.arms[Arm.RIGHT], goal.waist]) for goal in goals]
-        way = plan(np.stack([self.world.data.ctrl[ids].copy(), *rows]), ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed**2)
-        time_s = 0.0
-        while time_s < way.duration_s:
-            time_s += CONTROL_DT_S
-            self.world.data.ctrl[ids] = way.at(time_s)
-            yield
+        for goal in goals:
+            row = np.concatenate([goal.arms[Arm.LEFT], goal.arms[Arm.RIGHT], goal.waist])
+            ends = np.stack([self.world.data.ctrl[ids].copy(), row])
+            way = plan(ends, ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed**2)
+            time_s = 0.0
+            while time_s < way.duration_s:
+                time_s += CONTROL_DT_S
+                self.world.data.ctrl[ids] = way.at(time_s)
+                yield
 
     def stow_both(self) -> Skill:
         """Both arms to their ready postures, waist straight."""
@@ -507,11 +535,11 @@ class Body:
 
 
 @lru_cache(maxsize=8)
-def ready_posture(robot_name: str, arm: Arm) -> Array:
-    """See `Body.ready`; solved once per robot and arm."""
+def ready_posture(robot_name: str, arm: Arm, raised: bool = False) -> Array:
+    """See `Body.ready` and `Body.carrying`; solved once per robot and arm."""
     kit, reach_map = robot_kit(robot_name), reach_maps(robot_name)[arm.value]
     inward = np.array([0.0, -1.0 if arm is Arm.LEFT else 1.0, 0.0])
-    point = reach_map.shoulder + reach_map.reach_m * np.array([0.42, 0.0, -0.3])
+    point = reach_map.shoulder + reach_map.reach_m * np.array([0.3, 0.0, 0.16] if raised else [0.42, 0.0, -0.3])
     wish = HandPose(point, np.array([1.0, 0.0, 0.0]), inward)
     solver = PerArmSolver(kit.model, kit.crouches)
     columns = kit.model.indices(kit.spec.arms[arm.value].joints)

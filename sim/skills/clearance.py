@@ -59,6 +59,7 @@ class ClearanceProbe:
         model = world.model
         self._geoms = {arm: _limb_geoms(model, body.spec.arms[arm.value].joints[-2]) for arm in Arm}
         self._arm_adr = {arm: np.array([int(model.joint(n).qposadr[0]) for n in body.spec.arms[arm.value].joints]) for arm in Arm}
+        self._height_adr = [int(model.joint(name).qposadr[0]) for name in ("base_z", "base_pitch")]
         self._couplings = [
             (int(model.jnt_qposadr[model.eq_obj1id[e]]), int(model.jnt_qposadr[model.eq_obj2id[e]]), model.eq_data[e, 4::-1].copy())
             for e in range(model.neq)
@@ -97,6 +98,9 @@ class ClearanceProbe:
             if thing.held_by or name in ignore:
                 allowed.update(map(int, thing.geom_ids))
         scratch.qpos[:] = world.data.qpos
+        height = self._body.considered_height_m
+        if height is not None:
+            scratch.qpos[self._height_adr] = height, self._body.crouches.pitch(height)
         if opening is not None:
             self._shape_hand(arm, opening)
         mine = set(self._geoms[arm])

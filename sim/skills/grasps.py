@@ -34,15 +34,33 @@ class Grasp:
 
     Attributes:
         family: wrap, rim or top.
-        hand: pose of the grasp site at the grasp, world frame.
-        retreat: unit direction in which the hand comes and goes, away from the object.
+        middle: (3,) the gripped point of the object, world frame.
+        seat: where that point belongs in the hand: along the fingers and along the closing direction, metres.
+        pointing, closing: wished directions of the hand, world frame.
+        either_way: whether the opposite closing direction is as good.
+        from_above: whether the hand comes down on the object, instead of along its fingers.
         opening: how far the hand is open on arrival.
     """
 
     family: str
-    hand: HandPose
-    retreat: Array
+    middle: Array
+    seat: tuple[float, float]
+    pointing: Array
+    closing: Array
+    either_way: bool = False
+    from_above: bool = False
     opening: float = 1.0
+
+    def hand(self, pointing: Array | None = None, closing: Array | None = None) -> HandPose:
+        """The hand pose, for the wished directions or for those that an arm can reach."""
+        x = self.pointing if pointing is None else pointing
+        y = self.closing if closing is None else closing
+        site = self.middle - self.seat[0] * x - self.seat[1] * y
+        return HandPose(site, x, y, self.either_way and closing is None)
+
+    def retreat(self, pointing: Array) -> Array:
+        """Unit direction in which the hand leaves."""
+        return _UP if self.from_above else -pointing
 
 
 def _directions(center: Array, shoulder: Array, elevations_deg: tuple[float, ...]) -> Iterator[Array]:
@@ -117,7 +135,8 @@ def _wraps(thing: ObjectInstance, shape: _Shape, hand: HandShape, shoulder: Arra
                     radius = min(radius, float(np.sort(shape.half)[1]))
             if radius > hand.max_radius_m:
                 continue
-            forward, aside = hand.seat(radius)
+            seat = hand.seat(radius)
+            forward = seat[0]
             drop = max(-float(pointing[2]), 0.0)
             reach_down = (hand.tip_m - forward) * drop + hand.half_width_m * float(np.sqrt(1.0 - drop * drop)) + 0.008
             z = max(float(shape.grip[2]), shape.bottom + reach_down)
@@ -125,8 +144,7 @@ def _wraps(thing: ObjectInstance, shape: _Shape, hand: HandShape, shoulder: Arra
                 continue
             middle = np.array([shape.grip[0], shape.grip[1], z])
             for sign in (1.0, -1.0):
-                axis = sign * closing
-                yield Grasp("wrap", HandPose(middle - forward * pointing - aside * axis, pointing, axis), -pointing)
+                yield Grasp("wrap", middle, seat, pointing, sign * closing)
 
 
 def _rims(thing: ObjectInstance, shape: _Shape, hand: HandShape, shoulder: Array) -> Iterator[Grasp]:
@@ -143,11 +161,9 @@ def _rims(thing: ObjectInstance, shape: _Shape, hand: HandShape, shoulder: Array
         for pointing in _directions(edge, shoulder, (-60.0, -80.0, -40.0)):
             depth = min(0.03, 0.6 * (shape.top - shape.bottom))
             tip = np.array([edge[0], edge[1], shape.top - depth])
-            forward, aside = hand.seat(0.008)
+            seat = (hand.tip_m if hand.pinch_m is None else 0.05, hand.seat(0.008)[1])
             for sign in (1.0, -1.0):
-                axis = sign * radial
-                site = tip - pointing * (hand.tip_m if hand.pinch_m is None else 0.05) - aside * axis
-                yield Grasp("rim", HandPose(site, pointing, axis), -pointing)
+                yield Grasp("rim", tip, seat, pointing, sign * radial)
 
 
 def _tops(shape: _Shape, hand: HandShape, shoulder: Array) -> Iterator[Grasp]:
@@ -157,14 +173,12 @@ def _tops(shape: _Shape, hand: HandShape, shoulder: Array) -> Iterator[Grasp]:
         for pointing in _directions(top, shoulder, (-70.0, -50.0, -85.0, -30.0)):
             level = np.cross(_UP, pointing)
             level /= np.linalg.norm(level)
-            site = top - pointing * (hand.tip_m - 0.004)
-            yield Grasp("top", HandPose(site, pointing, level, either_way=True), -pointing)
+            yield Grasp("top", top, (hand.tip_m - 0.004, 0.0), pointing, level, either_way=True)
         return
     for pointing in _directions(top, shoulder, (-25.0, -10.0, -45.0)):
         closing = -_UP - float(-_UP @ pointing) * pointing
         closing /= np.linalg.norm(closing)
-        site = top - hand.pinch_m * closing - 0.04 * pointing
-        yield Grasp("top", HandPose(site, pointing, closing), _UP, opening=0.5)
+        yield Grasp("top", top, (0.04, hand.pinch_m), pointing, closing, from_above=True, opening=0.5)
 
 
 def _extent(rotation: Array, half: Array, direction: Array) -> float:

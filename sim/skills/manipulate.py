@@ -21,7 +21,7 @@ from sim.objects import ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_pick, check_place
 from sim.skills.grasps import Grasp, grasp_candidates
-from sim.skills.reach import Reach, out_of_reach, plan_reach, route
+from sim.skills.reach import Reach, blame, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill
 
@@ -45,41 +45,45 @@ def plan_pick(body: Body, arm: Arm, thing: ObjectInstance) -> tuple[Grasp, Reach
     Raises:
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
-    point = body.world.grips(thing.object_id)[0]
+    found = _find_grasp(body, arm, thing, _MAX_PLANS)
+    if found is not None:
+        return found
+
+    def elsewhere() -> None:
+        if _find_grasp(body, arm, thing, _MAX_PLANS // 3) is None:
+            raise SkillFailure(FailureCode.OBSTRUCTED)
+
+    raise blame(body, {arm: body.world.grips(thing.object_id)[0]}, elsewhere)
+
+
+def _find_grasp(body: Body, arm: Arm, thing: ObjectInstance, limit: int) -> tuple[Grasp, Reach] | None:
+    """The first grasp that the arm can do, of at most `limit` that are within its envelope."""
     tried = 0
-    reachable = False
     for grasp in grasp_candidates(body, arm, thing):
-        if not body.maps[arm.value].contains(body.in_trunk(grasp.hand.position)):
+        wish = grasp.hand()
+        if not body.within(arm, wish.position, body.pelvis_height_m):
             continue
-        reachable = True
         tried += 1
-        if tried > _MAX_PLANS:
-            break
-        reach = plan_reach(body, arm, grasp.hand, grasp.retreat, _APPROACH_M, (thing.object_id,), opening=grasp.opening)
+        if tried > limit:
+            return None
+        first = body.solve(arm, wish)
+        if not fulfils(first):
+            continue
+        # the arm points where it can: seat the object in the hand as it will really be turned
+        seated = grasp.hand(first.pointing, first.closing)
+        way = grasp.retreat(first.pointing)
+        reach = plan_reach(
+            body, arm, seated, way, _APPROACH_M, (thing.object_id,), pointing=0.97, closing=0.97, opening=grasp.opening, start=first.q
+        )
         if reach is not None:
             return grasp, reach
-    failure = out_of_reach(body, arm, point)
-    if failure is not None:
-        raise failure
-    raise _height_or(body, arm, point, FailureCode.OBSTRUCTED if reachable else FailureCode.TOO_FAR)
-
-
-def _height_or(body: Body, arm: Arm, point: Array, code: FailureCode) -> SkillFailure:
-    """A reachable point without a collision-free grasp: another height may help when this one is at the envelope's edge."""
-    present = body.pelvis_height_m
-    heights = body.heights_in_reach(arm, point)
-    if heights:
-        middle = 0.5 * (heights[0] + heights[-1])
-        if abs(middle - present) > 0.08:
-            failing = FailureCode.BODY_TOO_HIGH if middle < present else FailureCode.BODY_TOO_LOW
-            return SkillFailure(failing, {"height_m": middle - present})
-    margins = {"gap_m": 0.0} if code is FailureCode.OBSTRUCTED else {"reach_m": 0.0}
-    return SkillFailure(code, margins)
+    return None
 
 
 def stow(body: Body, arm: Arm, ignore: tuple[str | int, ...] = ()) -> Skill:
-    """Brings the arm to its ready posture, around what is in the way."""
-    goal = body.ready(arm)
+    """Brings the arm to its ready posture, or to the carrying one with something in the hand, around what is in the way."""
+    held = body.held[arm]
+    goal = body.ready(arm) if held is None or not body.thing(held).movable else body.carrying(arm)
     way = route(body, arm, body.commanded_arm(arm), goal, ignore)
     vias = way if way is not None else tuple(body.vias(arm))[:1]
     yield from body.move_arm(arm, [*vias, goal])
@@ -120,7 +124,8 @@ def pick(body: Body, action: Action, luck: Luck) -> Skill:
     yield from body.move_arm(arm, [reach.at], speed=0.8)
     yield from wait(0.06)
     geoms = body.solid_geoms(thing)
-    yield from _close(body, arm, geoms)
+    if grasp.opening > 0.9:
+        yield from _close(body, arm, geoms)
     gaps = body.probe.finger_gaps_m(arm, geoms)
     if max(gaps) > GRASP_GAP_M:
         yield from _retreat(body, arm, reach, name)
@@ -130,7 +135,7 @@ def pick(body: Body, action: Action, luck: Luck) -> Skill:
         raise SkillFailure(FailureCode.ALREADY_HELD)
     outcome = luck(action)
     body.world.attach(arm.value, thing.object_id)
-    yield from _lift(body, arm, grasp, name)
+    yield from _lift(body, arm)
     if outcome != "success":
         yield from _bad_luck(body, arm, thing, outcome)
     yield from stow(body, arm, name)
@@ -138,14 +143,13 @@ def pick(body: Body, action: Action, luck: Luck) -> Skill:
         raise SkillFailure(FailureCode.DROPPED)
 
 
-def _lift(body: Body, arm: Arm, grasp: Grasp, ignore: tuple[str | int, ...]) -> Skill:
-    """Raises the held object straight up, then draws it back towards the body."""
-    position, _ = body.hand_pose(arm)
+def _lift(body: Body, arm: Arm) -> Skill:
+    """Raises the held object straight up."""
+    position, hand = body.hand_pose(arm)
     current = body.commanded_arm(arm)
-    up = body.solve(arm, HandPose(position + _LIFT_M * _UP, grasp.hand.pointing, grasp.hand.closing), start=current)
+    up = body.solve(arm, HandPose(position + _LIFT_M * _UP, hand[:, 0], hand[:, 1]), start=current)
     if up.error_m < 0.03:
         yield from body.move_arm(arm, [up.q])
-    del ignore
 
 
 def _bad_luck(body: Body, arm: Arm, thing: ObjectInstance, outcome: str) -> Skill:
@@ -184,27 +188,28 @@ def plan_place(body: Body, arm: Arm, thing: ObjectInstance, receptacle: ObjectIn
     spots = body.free_spots(thing, receptacle, arm)
     if not spots:
         raise SkillFailure(FailureCode.RECEPTACLE_FULL)
-    nearest: Array | None = None
-    for spot in spots:
-        level = spot - offset + (0.0, 0.0, 0.006 - lowest)
-        if nearest is None:
-            nearest = level
-        sight = spot[:2] - shoulder[:2]
-        # keep the hand's azimuth relative to the line of sight, or turn the object a little
-        now = float(np.arctan2(pointing[1], pointing[0])) if np.hypot(*pointing[:2]) > 0.15 else None
-        base_turn = 0.0 if now is None else float(np.arctan2(sight[1], sight[0])) - now
-        for extra in (0.0, 0.35, -0.35, 0.75, -0.75):
-            turn = _turn_z(base_turn + extra)
-            moved = spot + (0.0, 0.0, 0.006 - lowest) - turn @ offset
-            wish = HandPose(moved, turn @ pointing, turn @ closing)
-            reach = plan_reach(
-                body, arm, wish, _UP, 0.08, (thing.object_id, receptacle.object_id), pointing=0.9, closing=0.93
-            )
-            if reach is not None:
-                return spot, reach, -(turn @ pointing)
-    assert nearest is not None
-    failure = out_of_reach(body, arm, nearest)
-    raise failure if failure is not None else _height_or(body, arm, nearest, FailureCode.OBSTRUCTED)
+    lift = np.array([0.0, 0.0, 0.006 - lowest])
+
+    def search() -> tuple[Array, Reach, Array]:
+        for spot in spots:
+            sight = spot[:2] - shoulder[:2]
+            # keep the hand's azimuth relative to the line of sight, or turn the object a little
+            now = float(np.arctan2(pointing[1], pointing[0])) if np.hypot(*pointing[:2]) > 0.15 else None
+            straight = 0.0 if now is None else float(np.arctan2(sight[1], sight[0])) - now
+            for extra in (0.0, 0.35, -0.35, 0.75, -0.75):
+                turn = _turn_z(straight + extra)
+                wish = HandPose(spot + lift - turn @ offset, turn @ pointing, turn @ closing)
+                reach = plan_reach(
+                    body, arm, wish, _UP, 0.08, (thing.object_id, receptacle.object_id), pointing=0.9, closing=0.93
+                )
+                if reach is not None:
+                    return spot, reach, -(turn @ pointing)
+        raise SkillFailure(FailureCode.OBSTRUCTED)
+
+    try:
+        return search()
+    except SkillFailure:
+        raise blame(body, {arm: spots[0] + lift - offset}, search) from None
 
 
 def place(body: Body, action: Action, luck: Luck) -> Skill:

@@ -6,7 +6,7 @@ does, BodyTooHigh; a higher one does, BodyTooLow; the present one should do but 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,14 +19,14 @@ from sim.skills.body import REACH_TOLERANCE_M, ArmGoal, Body
 from sim.skills.clearance import TOUCH_M
 from sim.skills.reach_map import HandPose
 
-__all__ = ["Reach", "out_of_reach", "plan_reach", "route"]
+__all__ = ["Reach", "blame", "plan_reach", "route"]
 
 Array = NDArray[np.float64]
 
 #: How well the fingers must agree with the wished directions (cosines) for a grasp to be tried.
 MIN_POINTING: Final = 0.75
 MIN_CLOSING: Final = 0.8
-_PATH_SAMPLES: Final = 6
+_PATH_SAMPLES: Final = 9
 _SLIDE_M: Final = 0.02
 
 
@@ -50,20 +50,30 @@ def fulfils(goal: ArmGoal, pointing: float = MIN_POINTING, closing: float = MIN_
     return goal.error_m <= REACH_TOLERANCE_M and goal.pointing_cos >= pointing and goal.closing_cos >= closing
 
 
-def out_of_reach(body: Body, arm: Arm, point: Array) -> SkillFailure | None:
-    """The failure of reaching for a world point from here, None when the point is within the arm's envelope."""
-    reach_map = body.maps[arm.value]
-    local = body.in_trunk(point)
-    if reach_map.contains(local):
-        return None
-    gap = max(reach_map.beyond_m(local), reach_map.gap_m(local))
-    heights = body.heights_in_reach(arm, point)
-    if not heights:
-        return SkillFailure(FailureCode.TOO_FAR, {"reach_m": gap})
+def blame(body: Body, points: Mapping[Arm, Array], plan: Callable[[], object]) -> SkillFailure:
+    """Why a plan failed: whether another pelvis height at this stance would have served, else distance or obstruction.
+
+    Args:
+        body: the robot.
+        points: what each arm reaches for, world frame.
+        plan: plans at the height under consideration; raises SkillFailure when it cannot.
+    """
     present = body.pelvis_height_m
-    nearest = min(heights, key=lambda height: abs(height - present))
-    code = FailureCode.BODY_TOO_HIGH if nearest < present else FailureCode.BODY_TOO_LOW
-    return SkillFailure(code, {"height_m": nearest - present, "reach_m": gap})
+    common = [height for height in body.heights() if all(body.within(arm, p, height) for arm, p in points.items())]
+    gap = max(max(body.maps[a.value].beyond_m(body.in_trunk(p)), body.maps[a.value].gap_m(body.in_trunk(p))) for a, p in points.items())
+    for height in sorted(common, key=lambda height: abs(height - present)):
+        if abs(height - present) < 0.03:
+            continue
+        try:
+            with body.considering(height):
+                plan()
+        except SkillFailure:
+            continue
+        code = FailureCode.BODY_TOO_HIGH if height < present else FailureCode.BODY_TOO_LOW
+        return SkillFailure(code, {"height_m": height - present, "reach_m": gap})
+    if not common or not all(body.within(arm, p, present) for arm, p in points.items()):
+        return SkillFailure(FailureCode.TOO_FAR, {"reach_m": gap})
+    return SkillFailure(FailureCode.OBSTRUCTED, {"gap_m": gap})
 
 
 def route(
@@ -98,6 +108,7 @@ def plan_reach(
     pointing: float = MIN_POINTING,
     closing: float = MIN_CLOSING,
     opening: float | None = None,
+    start: Array | None = None,
 ) -> Reach | None:
     """A motion to a hand pose that arrives along a straight line, None when there is none.
 
@@ -110,16 +121,17 @@ def plan_reach(
         ignore: ids of objects, or numbers of geoms, that may be touched at the target.
         pointing, closing: cosines that are demanded.
         opening: opening of the hand on the way, None as it is.
+        start: (A,) joints near the solution, when they are known.
     """
-    if not body.maps[arm.value].contains(body.in_trunk(wish.position)):
+    if not body.within(arm, wish.position, body.pelvis_height_m):
         return None
-    at = body.solve(arm, wish)
+    at = body.solve(arm, wish, start)
     if not fulfils(at, pointing, closing) or not body.probe.free(arm, [at.q], ignore, opening):
         return None
     before = None
     for share in (1.0, 0.6):
-        start = HandPose(wish.position + share * distance_m * retreat, wish.pointing, wish.closing, wish.either_way)
-        before = body.solve(arm, start, start=at.q)
+        short = HandPose(wish.position + share * distance_m * retreat, wish.pointing, wish.closing, wish.either_way)
+        before = body.solve(arm, short, start=at.q)
         if before.error_m <= 2.0 * REACH_TOLERANCE_M and float(np.max(np.abs(before.q - at.q))) < 1.5:
             break
         before = None

@@ -20,7 +20,7 @@ from sim.skills.body import Body, BothGoal, wait
 from sim.skills.checks import check_lift, check_place_both
 from sim.skills.grasps import solid_box
 from sim.skills.manipulate import GRASP_GAP_M, Luck
-from sim.skills.reach import out_of_reach, route
+from sim.skills.reach import blame, route
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill
 
@@ -88,15 +88,22 @@ def assess_lift(body: Body, action: Action) -> BothReach:
     thing = body.thing(action.object_id)
     check_lift(body, thing)
     sides = _sides(body, thing)
-    before = _goal(body, sides, _APART_M, None)
-    at = _goal(body, sides, 0.004, before.arms)
-    if before.error_m > _TOLERANCE_M or at.error_m > _TOLERANCE_M:
-        raise _unreachable(body, {arm: point for arm, (point, _) in sides.items()})
     name = (thing.object_id,)
-    for arm in Arm:
-        if not (body.probe.free(arm, [before.arms[arm]], opening=1.0) and body.probe.free(arm, [at.arms[arm]], name, 1.0)):
-            raise SkillFailure(FailureCode.OBSTRUCTED, {"gap_m": 0.0})
-    return BothReach(_way(body, before), before, at)
+
+    def search() -> BothReach:
+        before = _goal(body, sides, _APART_M, None)
+        at = _goal(body, sides, 0.004, before.arms)
+        if before.error_m > _TOLERANCE_M or at.error_m > _TOLERANCE_M:
+            raise SkillFailure(FailureCode.OBSTRUCTED)
+        for arm in Arm:
+            if not (body.probe.free(arm, [before.arms[arm]], opening=1.0) and body.probe.free(arm, [at.arms[arm]], name, 1.0)):
+                raise SkillFailure(FailureCode.OBSTRUCTED)
+        return BothReach(_way(body, before), before, at)
+
+    try:
+        return search()
+    except SkillFailure:
+        raise blame(body, {arm: point for arm, (point, _) in sides.items()}, search) from None
 
 
 def _way(body: Body, goal: BothGoal) -> BothGoal:
@@ -109,22 +116,6 @@ def _way(body: Body, goal: BothGoal) -> BothGoal:
             found = (body.vias(arm)[1],)
         middle[arm] = found[0] if found else 0.5 * (start + goal.arms[arm])
     return BothGoal(middle, 0.5 * (body.commanded_waist() + goal.waist), 0.0)
-
-
-def _unreachable(body: Body, points: Mapping[Arm, Array]) -> SkillFailure:
-    """Why both hands cannot reach their points at once: the first arm that has a reason, else a common height."""
-    for arm, point in points.items():
-        failure = out_of_reach(body, arm, point)
-        if failure is not None:
-            return failure
-    common = set.intersection(*(set(np.round(body.heights_in_reach(arm, p), 3)) for arm, p in points.items()))
-    if common:
-        middle = float(np.median(sorted(common)))
-        change = middle - body.pelvis_height_m
-        if abs(change) > 0.06:
-            code = FailureCode.BODY_TOO_HIGH if change < 0 else FailureCode.BODY_TOO_LOW
-            return SkillFailure(code, {"height_m": change})
-    return SkillFailure(FailureCode.TOO_FAR, {"reach_m": 0.0})
 
 
 def lift(body: Body, action: Action, luck: Luck) -> Skill:
@@ -205,23 +196,27 @@ def assess_place_both(body: Body, action: Action) -> tuple[BothGoal, BothGoal]:
     spots = body.free_spots(thing, receptacle, None)
     if not spots:
         raise SkillFailure(FailureCode.RECEPTACLE_FULL)
-    points: dict[Arm, Array] = {}
-    for spot in spots:
-        low, _ = body.world.bounds(thing.object_id)
-        origin = body.world.pose(thing.object_id)[:3, 3]
-        move = spot - origin + (0.0, 0.0, origin[2] - low[2] + 0.004)
-        wishes, above = {}, {}
-        for arm in Arm:
-            position, hand = body.hand_pose(arm)
-            wishes[arm] = HandPose(position + move, hand[:, 0], hand[:, 1])
-            above[arm] = HandPose(position + move + 0.07 * _UP, hand[:, 0], hand[:, 1])
-        if not points:
-            points = {arm: wish.position for arm, wish in wishes.items()}
-        at = body.solve_both(wishes, body.commanded_both())
-        before = body.solve_both(above, at.arms)
-        if at.error_m <= _TOLERANCE_M and before.error_m <= 1.5 * _TOLERANCE_M:
-            return before, at
-    raise _unreachable(body, points)
+    low, _ = body.world.bounds(thing.object_id)
+    origin = body.world.pose(thing.object_id)[:3, 3]
+    hands = {arm: body.hand_pose(arm) for arm in Arm}
+
+    def moves() -> list[Array]:
+        return [spot - origin + (0.0, 0.0, origin[2] - low[2] + 0.004) for spot in spots]
+
+    def search() -> tuple[BothGoal, BothGoal]:
+        for move in moves():
+            at_wish = {arm: HandPose(p + move, r[:, 0], r[:, 1]) for arm, (p, r) in hands.items()}
+            above = {arm: HandPose(p + move + 0.07 * _UP, r[:, 0], r[:, 1]) for arm, (p, r) in hands.items()}
+            at = body.solve_both(at_wish, body.commanded_both())
+            before = body.solve_both(above, at.arms)
+            if at.error_m <= _TOLERANCE_M and before.error_m <= 1.5 * _TOLERANCE_M:
+                return before, at
+        raise SkillFailure(FailureCode.OBSTRUCTED)
+
+    try:
+        return search()
+    except SkillFailure:
+        raise blame(body, {arm: p + moves()[0] for arm, (p, _) in hands.items()}, search) from None
 
 
 def place_both(body: Body, action: Action, luck: Luck) -> Skill:
