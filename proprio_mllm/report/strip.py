@@ -103,7 +103,7 @@ def draw_strip(frames: Sequence[Frame], title: str, path: Path, per_row: int = 8
     """Writes the frames as a picture, `per_row` steps in a line."""
     lines = -(-len(frames) // per_row)
     columns = min(per_row, len(frames))
-    figure = Figure(figsize=(2.4 * columns, 5.6 * lines + 0.4), layout="constrained")
+    figure = Figure(figsize=(2.4 * columns, 5.1 * lines + 0.4), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(2 * lines, columns, squeeze=False)
     for axes in grid.ravel():
