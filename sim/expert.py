@@ -1,7 +1,7 @@
 """The privileged expert: a planner that may look at the simulator's state. It certifies tasks and gives demonstrations.
 
 What comes next follows from goals and object states (`sim.tasks.jobs`); where to stand and how low follows from a trial of the
-arm action on the simulator's own reach test, without moving anything (`Session.assess`). The style is canonical on purpose, so
+arm action on the simulator's own reach test, without moving anything (`sim.rehearsal`). The style is canonical on purpose, so
 that a small model can imitate it: GoTo, then MoveDown or MoveUp where the arm needs it, then the arm action, on both arms
 at once where both can reach. The expert re-plans from the current state at every step, so failures and perturbations need no
 special case. It is marked privileged in every table; learned planners never see what it sees.
@@ -17,6 +17,7 @@ import numpy as np
 from data.records import Action, Arm, PlanStep
 from sim.failures import FailureCode, SkillFailure
 from sim.navigation import wrap_angle
+from sim.rehearsal import HEIGHT_STEP_M, Place, Rehearsal
 from sim.session import Session
 from sim.tasks.jobs import Facts, Job, plan_jobs
 from sim.tasks.predicates import Predicate
@@ -27,7 +28,11 @@ __all__ = ["Expert"]
 _STANCES: Final[tuple[tuple[float | None, float | None], ...]] = (
     (None, None), (0.5, None), (0.4, None), (0.6, None), (None, 20.0), (None, -20.0), (0.5, 30.0), (0.5, -30.0), (0.7, None),
 )  # fmt: skip
-_HEIGHT_STEP_M: Final = 0.05
+_PATIENCE: Final = 4
+#: Stances that are tried in thought before the first walk; more before the next ones.
+_REHEARSED: Final = 4
+#: Objects lower than this lie on the floor.
+_FLOOR_M: Final = 0.35
 _TURN_STEP_DEG: Final = 15.0
 #: Names of actions that change the stance.
 _MOVES: Final = ("GoTo", "Move", "Rotate")
@@ -58,7 +63,8 @@ class Expert:
         """Attaches to a session that has been reset with a task."""
         self._session = session
         self._attempts: dict[str, int] = {}
-        self._fruitless: set[str] = set()
+        self._fruitless: list[tuple[str, Place]] = []
+        self._rehearsal = Rehearsal(session)
         self._homes: dict[str, str] = {}
 
     def reset(self) -> None:
@@ -88,29 +94,43 @@ class Expert:
             return _single(Action("Done"))
         self._learn()
         head = jobs[0]
+        if self._lost(head, facts):
+            return _single(Action("Done"))
         verdicts: list[SkillFailure | None] = []
         for arm in self._arms(head, facts):
             action = head.action(arm)
             verdict = self._session.assess(action)
             verdicts.append(verdict)
-            if verdict is None and action.to_text() not in self._fruitless:
+            if verdict is not None:
+                self._fruitless.append((action.to_text(), self._rehearsal.here()))
+            elif not self._failed_at(action, self._rehearsal.here()):
                 return self._with_companion(head, arm, jobs[1:], facts)
         return _single(self._approach(head, verdicts, facts))
 
+    def _lost(self, job: Job, facts: Facts) -> bool:
+        """Whether the job's object lies on the floor, where neither robot reaches, or is broken."""
+        entry = facts.objects[job.target]
+        if not self._session.world.objects[job.target].movable or entry["isPickedUp"]:
+            return False
+        return bool(entry["isBroken"]) or (not entry["parentReceptacles"] and entry["center"]["z"] < _FLOOR_M)
+
     def _learn(self) -> None:
-        """Remembers what failed in the physics from this stance: trying it again from here would fail again."""
+        """Remembers what failed in the physics from where: trying it again from there would fail again."""
         history = self._session.history
         if not history:
             return
-        last = history[-1]
-        if last.step.startswith(_MOVES):
-            self._fruitless.clear()
-        for outcome in last.feedback.split("; "):
+        for outcome in history[-1].feedback.split("; "):
             text, _, code = outcome.rpartition(" ")
             if code in _FRUITLESS:
-                self._fruitless.add(text)
-            elif code == "ok" and "(" in text and not text.startswith(_MOVES):
+                self._fruitless.append((text, self._rehearsal.here()))
+            elif code == "ok" and not text.startswith(_MOVES):
                 self._attempts.clear()
+                self._fruitless.clear()
+
+    def _failed_at(self, action: Action, place: Place) -> bool:
+        """Whether the action has already failed in the physics from (about) there."""
+        text = action.to_text()
+        return any(text == other and place.near(there) for other, there in self._fruitless)
 
     def step(self, observation: object = None, feedback: object = None) -> PlanStep:
         """The planner interface; what it is shown does not matter to it."""
@@ -149,8 +169,7 @@ class Expert:
 
     def _approach(self, job: Job, verdicts: Sequence[SkillFailure | None], facts: Facts) -> Action:
         """The body action that brings an unreachable target into reach."""
-        session, target = self._session, job.target
-        known = session.known_objects
+        target, known = job.target, self._session.known_objects
         if target not in known:
             carrier = next((c for c in facts.objects[target]["parentReceptacles"] or () if c in known), None)
             attempt = self._attempts.get(f"find {target}", 0)
@@ -158,14 +177,24 @@ class Expert:
             if attempt == 0 and carrier is not None:
                 return Action("GoTo", object_id=carrier)
             return self._look_for(target, attempt)
-        for verdict in verdicts:
-            if verdict is not None and verdict.code in _WRONG_HEIGHT:
-                return self._height_change(verdict.margins["height_m"])
+        arms = self._arms(job, facts)
+        wrong = next((v for v in verdicts if v is not None and v.code in _WRONG_HEIGHT), None)
+        if wrong is not None or None in verdicts:
+            height = self._rehearsal.height_for(job, arms, None, self._failed_at)
+            if height is not None:
+                return self._height_change(height - self._session.body.pelvis_height_m)
         attempt = self._attempts.get(target, 0)
         self._attempts[target] = attempt + 1
-        if attempt >= len(_STANCES):
+        if attempt > _PATIENCE:
             return Action("Done")
-        distance, bearing = _STANCES[attempt]
+        for distance, bearing in _STANCES[: _REHEARSED * (attempt + 1)]:
+            action = Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
+            stance = self._rehearsal.stance_of(action)
+            if stance is None or (attempt and self._rehearsal.is_here(stance)):
+                continue
+            if self._rehearsal.height_for(job, arms, stance, self._failed_at) is not None:
+                return action
+        distance, bearing = _STANCES[attempt % len(_STANCES)]
         return Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
 
     def _look_for(self, target: str, attempt: int) -> Action:
@@ -177,9 +206,9 @@ class Expert:
         return Action("MoveBack", amount=0.3) if attempt % 3 else Action("MoveDown", amount=0.2)
 
     def _height_change(self, height_m: float) -> Action:
-        """The change of pelvis height, rounded away from zero to the grid, so that it is enough."""
-        steps = max(1, int(np.ceil(abs(height_m) / _HEIGHT_STEP_M - 1e-6)))
-        return Action("MoveUp" if height_m > 0 else "MoveDown", amount=round(steps * _HEIGHT_STEP_M, 2))
+        """The change of pelvis height on the grid."""
+        steps = max(1, round(abs(height_m) / HEIGHT_STEP_M))
+        return Action("MoveUp" if height_m > 0 else "MoveDown", amount=round(steps * HEIGHT_STEP_M, 2))
 
     def _bearing_rad(self, object_id: str) -> float:
         base = self._session.body.base()

@@ -36,7 +36,7 @@ TRAIN_SEEDS: Final = range(100_000, 2**31)
 
 #: Types that tasks move with one hand. Flat cutlery is left out: fingers of this size do not pick it up from a table.
 _SMALL_TYPES: Final = (
-    "Mug", "Cup", "Bowl", "Bottle", "WineBottle", "Apple", "Tomato", "Potato", "Bread", "Lettuce", "SaltShaker",
+    "Mug", "Cup", "Bowl", "Bottle", "WineBottle", "Apple", "Tomato", "Bread", "Lettuce", "SaltShaker",
     "PepperShaker", "PaperTowelRoll", "Kettle", "SoapBottle", "Book", "RemoteControl", "TissueBox", "Vase", "AlarmClock",
     "Pillow", "WateringCan",
 )  # fmt: skip
@@ -107,7 +107,7 @@ def _fits(kind: ObjectType, place: ObjectType) -> bool:
     """Whether an object can stand on a surface of a type, in any orientation, with its whole footprint."""
     radius, height = float(np.hypot(kind.size[0], kind.size[1])) / 2.0, kind.size[2]
     surfaces = [*place.surfaces, *(surface for moving in place.moving for surface in moving.surfaces)]
-    return any(min(s.rect[2], s.rect[3]) / 2.0 >= radius and (s.clearance >= height or not s.inside) for s in surfaces)
+    return any(min(s.rect[2], s.rect[3]) / 2.0 >= radius + 0.01 and (s.clearance >= height or not s.inside) for s in surfaces)
 
 
 def sample_task(
