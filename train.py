@@ -113,4 +113,5 @@ def main(arguments: Sequence[str]) -> int:
 if __name__ == "__main__":
     os.environ.setdefault("MUJOCO_GL", "egl")
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads double the cost where cores are shared
     sys.exit(main(sys.argv[1:]))
