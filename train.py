@@ -97,7 +97,7 @@ def _rollouts(*args: Any, **kwargs: Any) -> Any:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Command line; 0 on success, 2 on a configuration that is not allowed."""
+    """Command line; 0 on success, 1 when an input is missing, 2 on a configuration that is not allowed."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     for noisy in ("httpx", "datasets", "filelock", "OpenGL"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
@@ -106,7 +106,14 @@ def main(arguments: Sequence[str]) -> int:
     except ConfigError as error:
         sys.stderr.write(f"train.py: {error}\n")
         return 2
-    run(cfg)
+    from data.shards import ShardError
+    from proprio_mllm.training.pipeline import StageError
+
+    try:
+        run(cfg)
+    except (ShardError, StageError) as error:
+        sys.stderr.write(f"train.py: {error}\n")
+        return 1
     return 0
 
 

@@ -64,5 +64,5 @@ class MetricWriter:
     def close(self) -> None:
         """Ends the W&B run."""
         if self._run is not None:
-            self._run.finish(quiet=True)
+            self._run.finish()
             self._run = None

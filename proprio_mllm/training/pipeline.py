@@ -34,11 +34,18 @@ from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views, shard_hash
 from proprio_mllm.training.text import corpus, whole_words
 
-__all__ = ["STAGES", "Pipeline", "variant_model"]
+__all__ = ["NEEDS", "STAGES", "Pipeline", "StageError", "variant_model"]
 
 logger = logging.getLogger(__name__)
 
 Metrics = dict[str, float]
+
+#: Stages whose current output a stage starts from.
+NEEDS: Final[Mapping[str, tuple[str, ...]]] = {"alignment": ("base", "pointmap", "tokenizer"), "selu": ("alignment",)}
+
+
+class StageError(RuntimeError):
+    """A stage that cannot start; the message names the command to run first."""
 
 
 def variant_model(model: ModelConfig, variant: str) -> ModelConfig:
@@ -104,6 +111,9 @@ class Pipeline:
         if finished_key(folder) == key and not self.cfg.overwrite:
             logger.info("%s: current, skipped (%s)", name, folder)
             return None
+        for needed in NEEDS.get(name, ()):
+            if finished_key(self.paths.stage(needed)) != self.key(needed):
+                raise StageError(f"stage {name!r} needs the output of {needed!r}; run `python train.py stage={needed}` first")
         folder.mkdir(parents=True, exist_ok=True)
         began = time.monotonic()
         self._taken.clear()

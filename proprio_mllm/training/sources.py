@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from configs.schema.model import ModelConfig
 from data.motion import KEY_BODY_COUNT
 from data.records import Camera, HistoryItem
-from data.shards import ShardReader, decode_depth, decode_motion, decode_png, decode_segmentation
+from data.shards import Manifest, ShardError, ShardReader, decode_depth, decode_motion, decode_png, decode_segmentation
 from proprio_mllm.model.batch import Example, View
 from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
@@ -43,7 +43,17 @@ def held_out(key: str) -> bool:
 
 
 def shard_hash(folder: Path) -> str:
-    """Hash of a shard folder's manifest, which names the checksums of all its parts."""
+    """Hash of a shard folder's manifest, which names the checksums of all its parts.
+
+    Raises:
+        ShardError: when the folder holds no shards, or its producer has not finished.
+    """
+    try:
+        complete = Manifest.load(Path(folder)).complete
+    except ShardError as error:
+        raise ShardError(f"{error}; make them with `python train.py stage=data` and `stage=collect`") from error
+    if not complete:
+        raise ShardError(f"{folder}: its producer has not finished; run the same command again to continue it")
     return hashlib.sha256((Path(folder) / "manifest.json").read_bytes()).hexdigest()[:16]
 
 

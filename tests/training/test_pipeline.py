@@ -16,14 +16,15 @@ from configs.schema.model import ModelConfig
 from configs.schema.train import TrainConfig
 from configs.validate import ConfigError, build
 from data.records import Camera, Observation, Proprioception
-from data.shards import ShardWriter
+from data.shards import ShardError, ShardWriter
 from proprio_mllm.model.building import add_adapter, load_model
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.training import release
 from proprio_mllm.training.alignment import PHASES, AlignmentObjective
-from proprio_mllm.training.pipeline import Pipeline, variant_model
+from proprio_mllm.training.pipeline import Pipeline, StageError, variant_model
 from proprio_mllm.training.rollouts import RolloutRequest, read_rollouts, rollout_row
 from proprio_mllm.training.selu import CRITIC, copy_adapter, train_adapter
+from proprio_mllm.training.sources import shard_hash
 
 HELPERS = importlib.util.spec_from_file_location("training_helpers", Path(__file__).with_name("conftest.py"))
 assert HELPERS is not None
@@ -95,6 +96,19 @@ def test_current_stages_are_skipped_and_others_are_not(trained: Pipeline) -> Non
     assert changed.key("base") == trained.key("base")
     assert changed.key("pointmap") != trained.key("pointmap")
     assert changed.key("alignment") != trained.key("alignment")
+
+
+def test_a_stage_names_what_it_needs(trained: Pipeline, tmp_path: Path) -> None:
+    (tmp_path / "tiny").mkdir()
+    nothing = Pipeline(dataclasses.replace(trained.cfg, output=str(tmp_path)), collect)
+    with pytest.raises(ShardError, match=r"no such file.*make them with `python train.py stage=data`"):
+        nothing.run("base")
+    (tmp_path / "tiny" / "data").symlink_to(trained.paths.shards("views").parent, target_is_directory=True)
+    with pytest.raises(StageError, match=r"'alignment' needs the output of 'base'; run `python train.py stage=base` first"):
+        nothing.run("alignment")
+    ShardWriter(tmp_path / "half", "views", "h")
+    with pytest.raises(ShardError, match="its producer has not finished"):
+        shard_hash(tmp_path / "half")
 
 
 def test_metrics_are_reported(trained: Pipeline) -> None:
