@@ -3,7 +3,9 @@
     weights/<model>/<name>/     what `building.save_model` wrote, and
         provenance.json         command, seed, stage, keys and hashes of data and configuration, metrics, versions
 
-Git is not asked: hashes of data and configuration say what made the weights.
+Weights are stored as float16, half the size; they are read back as float32. The motion tokenizer keeps its precision, so that
+it gives the same tokens as in training, and the critic of stage 3 is left out: a planner does not need it. Git is not asked:
+hashes of data and configuration say what made the weights.
 """
 
 from __future__ import annotations
@@ -17,7 +19,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from safetensors.torch import load_file, save_file
+
 from proprio_mllm.training.paths import finished_key
+from proprio_mllm.training.selu import CRITIC
 from proprio_mllm.training.sources import shard_hash
 
 if TYPE_CHECKING:
@@ -58,6 +63,7 @@ def export(pipeline: Pipeline, folder: str | Path, command: str) -> list[Path]:
         work = target.with_name(target.name + ".tmp")
         shutil.rmtree(work, ignore_errors=True)
         shutil.copytree(source, work)
+        _shrink(work)
         metrics = json.loads((paths.stage(stage) / "done.json").read_text(encoding="utf-8"))["metrics"]
         (work / "provenance.json").write_text(json.dumps(_provenance(pipeline, stage, key, command, metrics), indent=1) + "\n")
         size = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) / 1e6
@@ -68,6 +74,19 @@ def export(pipeline: Pipeline, folder: str | Path, command: str) -> list[Path]:
         os.replace(work, target)
         written.append(target)
     return written
+
+
+def _shrink(folder: Path) -> None:
+    """Halves floating-point weights and drops the critic's adapter."""
+    shutil.rmtree(folder / "adapters" / CRITIC, ignore_errors=True)
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    config["adapters"] = [name for name in config["adapters"] if name != CRITIC]
+    (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+    for path in folder.rglob("*.safetensors"):
+        if path.parent == folder / "motion":
+            continue
+        tensors = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in load_file(path).items()}
+        save_file(tensors, path, {"format": "pt"})
 
 
 def _provenance(pipeline: Pipeline, stage: str, key: str, command: str, metrics: dict[str, Any]) -> dict[str, Any]:
@@ -84,6 +103,7 @@ def _provenance(pipeline: Pipeline, stage: str, key: str, command: str, metrics:
         "seed": pipeline.cfg.seed,
         "shards": shards,
         "metrics": metrics,
+        "stored_as": "float16",
         "config": dataclasses.asdict(pipeline.cfg),
         "versions": {name: version(name) for name in ("torch", "transformers", "peft")} | {"python": platform.python_version()},
     }

@@ -191,7 +191,13 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
     assert about["command"] == "python train.py stage=all"
     assert set(about["shards"]) == {"clips", "views", "demos"}
-    load_model(tmp_path / "tiny" / "full")
+    ours, released = load_model(trained.paths.model("selu")), load_model(tmp_path / "tiny" / "full")
+    theirs = dict(released.named_parameters())
+    assert all(tensor.dtype == torch.float32 for tensor in theirs.values())
+    for name, tensor in ours.named_parameters():
+        if CRITIC not in name:
+            torch.testing.assert_close(theirs[name], tensor, atol=1e-4, rtol=1e-3)
+    assert not (tmp_path / "tiny" / "full" / "adapters" / CRITIC).exists()
     assert release.find_model("nowhere", tmp_path, "tiny", "full", "selu") == tmp_path / "tiny" / "full"
     assert release.find_model(trained.cfg.output, tmp_path, "tiny", "full", "selu") == trained.paths.model("selu")
     with pytest.raises(FileNotFoundError, match="no selu model of tiny \\(no_cse\\)"):
