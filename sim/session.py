@@ -143,9 +143,7 @@ class Session:
     body: Body
     task: TaskLike
 
-    def __init__(
-        self, robot: str, difficulty: str = "easy", image_size: int = 112, contingency: str = "default"
-    ) -> None:
+    def __init__(self, robot: str, difficulty: str = "easy", image_size: int = 112, contingency: str = "default") -> None:
         self.robot = load_robot(robot)
         self.image_size = image_size
         self._config = load_contingency(contingency)

@@ -31,7 +31,7 @@ from sim.scene import BASE_JOINTS
 from sim.skills.clearance import ClearanceProbe
 from sim.skills.hands import hand_shape
 from sim.skills.obstacles import navigation_map
-from sim.skills.reach_map import HandPose, ReachMap, reach_maps
+from sim.skills.reach_map import WOUND_RAD, HandPose, ReachMap, reach_maps
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.trajectory import plan
 from sim.world import World
@@ -47,6 +47,8 @@ _WORKTOP_M: Final = 0.97
 HAND_SECONDS: Final = 0.35
 #: Position error of an arm posture that still counts as reaching.
 REACH_TOLERANCE_M: Final = 0.012
+#: How far the ready hand is below the shoulder, as a share of the arm's reach.
+_READY_DROP: Final = 0.17
 #: Steps of pelvis height tried when a target is out of reach, metres.
 _HEIGHT_STEP_M: Final = 0.05
 
@@ -341,7 +343,7 @@ class Body:
 
         A load before a hand that is lower than a worktop would run into its front when the robot steps up to it.
         """
-        ready_m = self.spec.standing_pelvis_height_m + float(self.maps[arm.value].shoulder[2]) - 0.3 * self.maps[arm.value].reach_m
+        ready_m = self.spec.standing_pelvis_height_m + float(self.maps[arm.value].shoulder[2]) - _READY_DROP * self.maps[arm.value].reach_m
         return ready_posture(self.spec.name, arm, raised=ready_m < _WORKTOP_M)
 
     def solve(
@@ -400,9 +402,11 @@ class Body:
             reached = self.kinematics.frames(root, result.q, site)[0, :3, :3]
             pointing = 1.0 if local.pointing is None else float(reached[:, 0] @ local.pointing)
             along = 1.0 if local.closing is None else float(reached[:, 1] @ local.closing)
+            q_arm = result.q[self._columns[arm]].copy()
+            wound = float(np.max(np.abs(q_arm - np.asarray(self.spec.arms[arm.value].carry))[:-1]))
             goal = ArmGoal(
-                result.q[self._columns[arm]].copy(),
-                result.position_error_m,
+                q_arm,
+                result.position_error_m if wound < WOUND_RAD + 0.3 else 1.0,
                 pointing,
                 abs(along) if local.either_way else along,
                 self.turn_to_world(reached[:, 0]),
@@ -539,7 +543,7 @@ def ready_posture(robot_name: str, arm: Arm, raised: bool = False) -> Array:
     """See `Body.ready` and `Body.carrying`; solved once per robot and arm."""
     kit, reach_map = robot_kit(robot_name), reach_maps(robot_name)[arm.value]
     inward = np.array([0.0, -1.0 if arm is Arm.LEFT else 1.0, 0.0])
-    point = reach_map.shoulder + reach_map.reach_m * np.array([0.3, 0.0, 0.16] if raised else [0.42, 0.0, -0.3])
+    point = reach_map.shoulder + reach_map.reach_m * np.array([0.3, 0.0, 0.16] if raised else [0.3, 0.0, -_READY_DROP])
     wish = HandPose(point, np.array([1.0, 0.0, 0.0]), inward)
     solver = PerArmSolver(kit.model, kit.crouches)
     columns = kit.model.indices(kit.spec.arms[arm.value].joints)

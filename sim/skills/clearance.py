@@ -24,7 +24,7 @@ __all__ = ["TOUCH_M", "ClearanceProbe"]
 Array = NDArray[np.float64]
 
 #: Penetration that still counts as touching only.
-TOUCH_M: Final = 0.008
+TOUCH_M: Final = 0.009
 #: Distance beyond which finger gaps are not measured.
 _FAR_M: Final = 0.2
 

@@ -73,7 +73,7 @@ def _find_grasp(body: Body, arm: Arm, thing: ObjectInstance, limit: int) -> tupl
         seated = grasp.hand(first.pointing, first.closing)
         way = grasp.retreat(first.pointing)
         reach = plan_reach(
-            body, arm, seated, way, _APPROACH_M, (thing.object_id,), pointing=0.97, closing=0.97, opening=grasp.opening, start=first.q
+            body, arm, seated, way, _APPROACH_M, pointing=0.97, closing=0.97, opening=grasp.opening, start=first.q
         )
         if reach is not None:
             return grasp, reach

@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 #: How well the fingers must agree with the wished directions (cosines) for a grasp to be tried.
 MIN_POINTING: Final = 0.75
 MIN_CLOSING: Final = 0.8
-_PATH_SAMPLES: Final = 9
-_SLIDE_M: Final = 0.02
+_PATH_STEP_RAD: Final = 0.12
+_SLIDE_M: Final = 0.012
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,15 +81,16 @@ def route(
 ) -> tuple[Array, ...] | None:
     """Postures to pass between two arm postures without a collision: none, or one with the hand drawn in or raised."""
     ignore = tuple(ignore)
-    fractions = np.linspace(0.0, 1.0, _PATH_SAMPLES)[:, None]
     best: tuple[float, tuple[Array, ...]] | None = None
     for via in (None, *body.vias(arm)):
         legs = [(start, goal)] if via is None else [(start, via), (via, goal)]
-        samples = np.concatenate([a + fractions * (b - a) for a, b in legs])
-        depths = body.probe.depths_m(arm, samples, ignore, opening)
-        # an arm that touches something at the start may do so until it has come away from it
-        excess = depths - np.concatenate([depths[0] * (1.0 - 0.8 * fractions[:, 0]), np.zeros(len(samples) - _PATH_SAMPLES)])
-        worst = float(excess.max())
+        worst = 0.0
+        for number, (a, b) in enumerate(legs):
+            shares = np.linspace(0.0, 1.0, 2 + int(np.max(np.abs(b - a)) / _PATH_STEP_RAD))
+            depths = body.probe.depths_m(arm, a + shares[:, None] * (b - a), ignore, opening)
+            # an arm that touches something at the start may do so until it has come away from it
+            excess = depths - depths[0] * (1.0 - 0.8 * shares) if number == 0 else depths
+            worst = max(worst, float(excess.max()))
         if worst <= TOUCH_M:
             return () if via is None else (via,)
         if best is None or worst < best[0]:
@@ -135,7 +136,10 @@ def plan_reach(
         if before.error_m <= 2.0 * REACH_TOLERANCE_M and float(np.max(np.abs(before.q - at.q))) < 1.5:
             break
         before = None
-    if before is None or not body.probe.free(arm, [before.q], ignore, opening):
+    if before is None:
+        return None
+    approach = [before.q + share * (at.q - before.q) for share in (0.0, 0.33, 0.66)]
+    if not body.probe.free(arm, approach, ignore, opening):
         return None
     way = route(body, arm, body.commanded_arm(arm), before.q, (), opening)
     return None if way is None else Reach(way, before.q, at.q)

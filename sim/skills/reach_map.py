@@ -21,11 +21,13 @@ from scipy.spatial import cKDTree
 from sim.robots.kinematics import RobotModel
 from sim.robots.spec import load_robot
 
-__all__ = ["HandPose", "ReachMap", "reach_maps"]
+__all__ = ["WOUND_RAD", "HandPose", "ReachMap", "reach_maps"]
 
 Array = NDArray[np.float64]
 
-_SAMPLES: Final = 60000
+_SAMPLES: Final = 80000
+#: Postures that are farther than this from the carrying one in any joint are left out: such arms are wound up.
+WOUND_RAD: Final = 2.0
 #: A point counts as within the envelope when a sampled hand is at most this far from it.
 _ENVELOPE_M: Final = 0.045
 #: Weight of the position error (per metre) against the orientation error (1 - cosine) when a posture is chosen.
@@ -150,8 +152,9 @@ def reach_maps(robot_name: str) -> dict[str, ReachMap]:
         pin.framesForwardKinematics(robot.model, robot.data, base)
         shoulder = robot.data.oMf[robot.frame_id(spec.key_bodies[f"{side}_shoulder"])].translation.copy()
         positions = hands[side][:, 0].copy()
-        sensible = positions[:, 0] > -0.05  # hands behind the back are of no use
-        reach = float(np.linalg.norm(positions - shoulder, axis=1).max())
+        wound = np.abs(draws[side] - np.asarray(spec.arms[side].carry))[:, :-1].max(axis=1)  # the wrist may roll freely
+        sensible = (positions[:, 0] > -0.05) & (wound < WOUND_RAD)  # hands behind the back are of no use
+        reach = float(np.linalg.norm(positions[sensible] - shoulder, axis=1).max())
         kept = positions[sensible]
         x_axes, y_axes = hands[side][sensible, 1], hands[side][sensible, 2]
         maps[side] = ReachMap(draws[side][sensible], kept, x_axes, y_axes, shoulder, reach, cKDTree(kept))
