@@ -226,14 +226,16 @@ def keep(
 
 
 def actor_examples(kept: Sequence[Kept], style: Style, last: int) -> list[Example]:
-    """Planning examples of kept trajectories: every step that worked, and `Done()` once the goal holds."""
+    """Planning examples of kept trajectories: every step that worked, up to the moment at which the goal held.
+
+    `Done()` is never a target: an episode ends by itself when its goals hold, and relabelled goals would teach to stop early.
+    """
     examples: list[Example] = []
     for item in kept:
         t, rollout = item.trajectory, item.trajectory.rollout
-        for at in range(item.end + 1):
+        for at in range(item.end):
             moment = rollout.moments[at]
-            target = "Done()" if at == item.end else moment.step
-            if at < item.end and (not moment.ok or moment.step == "Done()"):
+            if not moment.ok or moment.step == "Done()":
                 continue
             prompt = plan_prompt(
                 item.goal,
@@ -247,7 +249,7 @@ def actor_examples(kept: Sequence[Kept], style: Style, last: int) -> list[Exampl
                 style,
                 last,
             )
-            examples.append(Example(with_answer(prompt, target), (rollout.view(at),)))
+            examples.append(Example(with_answer(prompt, moment.step), (rollout.view(at),)))
     return examples
 
 

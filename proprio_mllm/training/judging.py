@@ -1,9 +1,8 @@
 """Judging exercises from expert logs: was the goal completed, and which objects are in a state.
 
 A released model can answer such questions; the tiny one has to learn it. The answers come from what the log itself says (an
-action with `ok`, or the expert's `Done()`), never from privileged simulator state, so a judge learns to read its inputs only.
-
-Shape letters: none.
+action with `ok`, or the end of an expert's successful episode), never from privileged simulator state, so a judge learns to
+read its inputs only.
 """
 
 from __future__ import annotations
@@ -81,22 +80,24 @@ def states_from_log(history: Sequence[HistoryItem]) -> dict[str, tuple[str, ...]
 def judge_example(demos: Demos, index: int, rng: np.random.Generator, motion: Sequence[int] | None) -> Example:
     """A judging conversation about the state before expert step `index`, with its answer.
 
-    Half of them ask whether a goal was completed: the episode's own (yes exactly when the expert's next step is `Done()`) or
-    another episode's instruction; the others ask which objects are in a relation.
+    Half of them ask whether a goal was completed: the episode's own, which is so after its last step only, or another
+    episode's instruction; the others ask which objects are in a relation. The view after the last step is not recorded: the
+    one before it stands in, with the last step in the log.
     """
-    row = demos.reader[int(index)]
-    style = demos.style
-    if rng.random() < 0.5 and len(demos.finals):
-        row = demos.reader[int(rng.choice(demos.finals))] if rng.random() < 0.5 else row
-        goal, done = row["instruction"], row["target"] == "Done()"
-        if done and rng.random() < 0.35:
+    row, style = demos.reader[int(index)], demos.style
+    ended = rng.random() < 0.6 and len(demos.finals) > 0
+    if ended:
+        row = demos.reader[int(rng.choice(demos.finals))]
+    history = _history(row)
+    if ended:
+        history.append(HistoryItem(row["target"], "; ".join(f"{part.strip()} ok" for part in row["target"].split("&"))))
+    if rng.random() < 0.5:
+        goal, done = row["instruction"], ended
+        if ended and rng.random() < 0.3:
             other = demos.reader[int(rng.choice(demos.finals))]["instruction"]
-            done = other == goal
-            goal = other
-        history = _history(row)
+            done, goal = other == goal, other
         prompt = critic_prompt(goal, row["visible"], history, motion, style, LOG_LENGTH)
         return Example(with_answer(prompt, "yes" if done else "no"), (demos.view(row),))
-    history = _history(row)
     states = states_from_log(history[-LOG_LENGTH:])
     full = [name for name, things in states.items() if things]
     names = full if full and rng.random() < 0.7 else sorted(states)

@@ -152,9 +152,11 @@ class Demos:
         self.reader = ShardReader(folder, "demos")
         self.split = _Split(self.reader.column("episode"), folder)
         self.motions = np.stack([decode_motion(m) for m in self.reader.column("motion")])  # (N, T, F)
-        done = np.array([target == "Done()" for target in self.reader.column("target")], dtype=bool)
-        #: Training rows whose expert step ends the episode.
-        self.finals = np.intersect1d(np.flatnonzero(done), self.split.train)
+        last: dict[str, tuple[int, int]] = {}
+        for index, (episode, step) in enumerate(zip(self.reader.column("episode"), self.reader.column("step"), strict=True)):
+            last[episode] = max(last.get(episode, (-1, -1)), (int(step), index))
+        #: Training rows of each episode's last step, after which the goals held: collectors keep successes only.
+        self.finals = np.intersect1d([index for _, index in last.values()], self.split.train)
         self.style: Style = cfg.prompt
         self._cfg = cfg
 

@@ -96,7 +96,7 @@ def write_views(folder: Path, count: int = 40) -> Path:
     return folder
 
 
-PLAN = ("GoTo(Mug_1)", "MoveDown(0.2)", "Pick(left, Mug_1)", "Done()")
+PLAN = ("GoTo(Mug_1)", "MoveDown(0.2)", "Pick(left, Mug_1)")
 
 
 def write_demos(folder: Path, episodes: int = 40) -> Path:

@@ -1,0 +1,107 @@
+"""Judging exercises, and how a critic's verdicts become examples; the critic here is a scripted one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from configs.schema.model import ModelConfig
+from proprio_mllm.training.critic import Judge, Trajectory, actor_examples, audit, critic_examples, keep
+from proprio_mllm.training.goals import Relabel
+from proprio_mllm.training.judging import judge_example
+from proprio_mllm.training.rollouts import Moment, Rollout
+from proprio_mllm.training.sources import Demos
+
+KNOWN = ("Mug_1", "Plate_1", "CoffeeTable_1")
+
+
+class Scripted(Judge):
+    """Says yes to given (episode, moment, goal) triples, and answers every question with one reply."""
+
+    def __init__(self, yes: set[tuple[str, int, str]], reply: str = "none") -> None:
+        self.yes, self.reply = yes, reply
+
+    def completed(self, queries: Sequence[tuple[Trajectory, int, str]]) -> list[bool]:
+        return [(t.rollout.episode, at, goal) in self.yes for t, at, goal in queries]
+
+    def ask(self, trajectory: Trajectory, relation: str) -> str:
+        return self.reply
+
+
+def trajectory(episode: str, steps: Sequence[tuple[str, bool]], instruction: str, success: bool) -> Trajectory:
+    moments = [Moment(text, f"{text} {'ok' if ok else 'Blocked'}", ok, KNOWN[:2], KNOWN) for text, ok in steps]
+    moments.append(Moment("", "", True, KNOWN[:2], KNOWN))
+    count = len(moments)
+    from data.shards import encode_png
+
+    row = {
+        "images": [encode_png(np.zeros((112, 112, 3), dtype=np.uint8))] * count,
+        "intrinsics": np.eye(3).ravel(),
+        "cameras_in_pelvis": [np.eye(4).ravel()] * count,
+        "key_bodies": [np.zeros(42)] * count,
+        "height": 112,
+        "width": 112,
+    }
+    relations = {"held": ["Plate_1"]}
+    rollout = Rollout(episode, "h1", "single", instruction, 8, tuple(moments), (), success, relations, row)
+    return Trajectory(rollout, (None,) * count)
+
+
+PICK_PLATE = [("GoTo(Plate_1)", True), ("Pick(left, Plate_1)", False), ("Pick(right, Plate_1)", True), ("MoveAhead(0.3)", True)]
+
+
+def test_relabelling_and_truncation() -> None:
+    good = trajectory("a", [("GoTo(Mug_1)", True), ("Pick(left, Mug_1)", True)], "Pick up the mug.", True)
+    wrong = trajectory("b", PICK_PLATE, "Pick up the mug.", False)
+    plate = "Pick up the plate."
+    judge = Scripted({("a", 2, "Pick up the mug."), ("b", 3, plate), ("b", 4, plate)}, "Plate_1")
+    goals: dict[tuple[str, str], Relabel] = {}
+    examples = critic_examples([good, wrong], judge, "terse", goals)
+    assert [(one.kind, one.episode, one.example.messages[-1].text) for one in examples] == [
+        ("direct", "a", "yes"),
+        ("negative", "b", "no"),
+        ("relabel", "b", "yes"),
+    ]
+    assert list(goals) == [("b", plate)]
+    kept = keep([good, wrong], goals, judge, 10)
+    assert [(item.goal, item.end, item.relabelled) for item in kept] == [("Pick up the mug.", 2, False), (plate, 3, True)]
+    targets = [example.messages[-1].text for example in actor_examples(kept, "terse", 4)]
+    # The failed step is context, not a target, and nothing after the first success is learnt.
+    assert targets == ["GoTo(Mug_1)", "Pick(left, Mug_1)", "GoTo(Plate_1)", "Pick(right, Plate_1)"]
+    scores = audit([good, wrong], goals, judge)
+    assert scores["precision"] == scores["recall"] == 1.0
+    assert scores["judged"] == 3.0
+
+
+def test_a_hallucinated_yes_lowers_precision() -> None:
+    wrong = trajectory("b", PICK_PLATE, "Pick up the mug.", False)
+    scores = audit([wrong], {}, Scripted({("b", 4, "Pick up the mug.")}))
+    assert scores["precision"] == 0.0
+    assert "recall" not in scores
+
+
+def test_duplicates_and_caps() -> None:
+    same = [trajectory(name, PICK_PLATE[:1], "Pick up the mug.", True) for name in "ab"]
+    judge = Scripted({(name, 1, "Pick up the mug.") for name in "abcd"})
+    assert len(keep(same, {}, judge, 10)) == 1
+    others = [trajectory(name, [(f"MoveAhead(0.{n})", True)], "Pick up the mug.", True) for n, name in enumerate("abcd", 1)]
+    assert len(keep(others, {}, judge, 2)) == 2
+
+
+@pytest.fixture
+def demos(shards: Path, cfg: ModelConfig) -> Demos:
+    return Demos(shards / "demos", cfg)
+
+
+def test_judging_exercises_have_both_answers(demos: Demos) -> None:
+    rng = np.random.default_rng(0)
+    found = [judge_example(demos, int(rng.choice(demos.split.train)), rng, None) for _ in range(200)]
+    replies = [example.messages[-1].text for example in found]
+    assert replies.count("yes") > 10
+    assert replies.count("no") > 10
+    assert any(reply.endswith("_1") for reply in replies)
+    done = next(example for example in found if example.messages[-1].text == "yes")
+    assert "Pick(left" in done.messages[1].text
