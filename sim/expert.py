@@ -1,23 +1,24 @@
 """The privileged expert: a planner that may look at the simulator's state. It certifies tasks and gives demonstrations.
 
-What comes next follows from goals and object states (`sim.tasks.jobs`); where to stand and how low follows from a trial of the
-arm action on the simulator's own reach test, without moving anything (`sim.rehearsal`). The style is canonical on purpose, so
-that a small model can imitate it: GoTo, then MoveDown or MoveUp where the arm needs it, then the arm action, on both arms
-at once where both can reach. The expert re-plans from the current state at every step, so failures and perturbations need no
-special case. It is marked privileged in every table; learned planners never see what it sees.
+What comes next follows from goals and object states (`sim.tasks.jobs`); whether an arm can do it from here, and how much lower
+or higher the pelvis would have to be, from the simulator's own reach test (`Session.assess`), which moves nothing. The style is
+canonical on purpose, so that a small model can imitate it: GoTo, then MoveDown or MoveUp where the arm needs it, then the arm
+action, on both arms at once where both can reach. The expert re-plans from the current state at every step, so failures and
+perturbations need no special case. It is marked privileged in every table; learned planners never see what it sees.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from data.records import Action, Arm, PlanStep
 from sim.failures import FailureCode, SkillFailure
-from sim.navigation import wrap_angle
-from sim.rehearsal import HEIGHT_STEP_M, Place, Rehearsal
+from sim.navigation import Stance, wrap_angle
+from sim.rehearsal import HEIGHT_STEP_M, Rehearsal
 from sim.session import Session
 from sim.tasks.jobs import Facts, Job, plan_jobs
 from sim.tasks.predicates import Predicate
@@ -26,17 +27,20 @@ __all__ = ["Expert"]
 
 #: Distances (m) and bearings (deg) that GoTo tries in turn when its own choice of stance does not serve.
 _STANCES: Final[tuple[tuple[float | None, float | None], ...]] = (
-    (None, None), (0.5, None), (0.4, None), (0.6, None), (None, 20.0), (None, -20.0), (0.5, 30.0), (0.5, -30.0), (0.7, None),
+    (None, None), (None, -20.0), (None, 20.0), (0.5, None), (0.4, None), (0.6, None), (0.5, -30.0), (0.5, 30.0),
 )  # fmt: skip
-_PATIENCE: Final = 4
-#: Stances that are tried in thought before the first walk; more before the next ones.
-_REHEARSED: Final = 4
-#: Objects lower than this lie on the floor.
-_FLOOR_M: Final = 0.35
 _TURN_STEP_DEG: Final = 15.0
-#: Names of actions that change the stance.
+#: Changes of height that are tried at one stance before another stance is.
+_HEIGHT_TRIALS: Final = 2
+#: Looks around for an object that should be near, before giving up.
+_LOOKS: Final = 6
+#: Objects lower than this lie on the floor, out of reach.
+_FLOOR_M: Final = 0.35
+#: Farther away than this, an arm need not be asked.
+_FAR_M: Final = 1.1
+#: Names of actions that change the stance or the height.
 _MOVES: Final = ("GoTo", "Move", "Rotate")
-#: Codes of failures that the physics, not bad luck, decided.
+#: Failures that the physics, not bad luck, decided: the same action from the same place would fail again.
 _FRUITLESS: Final = tuple(
     code.value
     for code in (
@@ -50,6 +54,20 @@ _FRUITLESS: Final = tuple(
 _WRONG_HEIGHT: Final = (FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW)
 
 
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where the robot stands and how high its pelvis is."""
+
+    stance: Stance
+    height_m: float
+
+    def near(self, other: _Place) -> bool:
+        """Whether two places differ by less than the servos' and the grid's tolerance."""
+        gap = float(np.linalg.norm(self.stance.position - other.stance.position))
+        turn = abs(wrap_angle(self.stance.yaw_rad - other.stance.yaw_rad))
+        return gap < 0.03 and turn < 0.07 and abs(self.height_m - other.height_m) < 0.5 * HEIGHT_STEP_M
+
+
 class Expert:
     """Plans one step at a time for a session.
 
@@ -60,52 +78,86 @@ class Expert:
     privileged: Final = True
 
     def __init__(self, session: Session) -> None:
-        """Attaches to a session that has been reset with a task."""
+        """Attaches to a session."""
         self._session = session
         self._attempts: dict[str, int] = {}
-        self._fruitless: list[tuple[str, Place]] = []
-        self._rehearsal = Rehearsal(session)
+        self._fruitless: list[tuple[str, _Place]] = []
         self._homes: dict[str, str] = {}
+        self._gone: dict[str, set[str]] = {}
+        self._rehearsal = Rehearsal(session)
 
     def reset(self) -> None:
         """Forgets earlier attempts; call after the session's reset."""
         self._attempts.clear()
         self._fruitless.clear()
+        self._gone.clear()
         self._homes = {placement.object_id: placement.receptacle for placement in self._session.task.placements or ()}
-
-    @property
-    def _goals(self) -> list[Predicate]:
-        return [goal for goal in self._session.task.goals if isinstance(goal, Predicate)]
 
     def facts(self) -> Facts:
         """What the planner reads from the simulator."""
         session = self._session
         objects = {entry["objectId"]: entry for entry in session.world.metadata()["objects"]}
-        body = session.body
-        two_handed = frozenset(name for name in session.world.objects if session.world.needs_two_hands(name))
-        held = {arm: body.held[arm] for arm in Arm}
-        return Facts(objects, held, body.lifted, two_handed, self._homes)
+        lifted = session.body.lifted
+        two_handed = frozenset(
+            name for name, thing in session.world.objects.items() if thing.movable and session.world.needs_two_hands(name)
+        )
+        held = {arm: None if item == lifted else item for arm, item in session.body.held.items()}
+        return Facts(objects, held, lifted, two_handed, self._homes)
+
+    def step(self, observation: object = None, feedback: object = None) -> PlanStep:
+        """The planner interface; what it is shown does not matter to it."""
+        del observation, feedback
+        return self.next_step()
 
     def next_step(self) -> PlanStep:
-        """The step to take from the current state; Done when every goal holds."""
+        """The step to take from the current state; Done when every goal holds, or when nothing more can be done."""
         facts = self.facts()
-        jobs = plan_jobs(self._goals, facts)
-        if not jobs:
+        goals = [goal for goal in self._session.task.goals if isinstance(goal, Predicate)]
+        jobs = plan_jobs(goals, facts)
+        if not jobs or self._lost(jobs[0], facts):
             return _single(Action("Done"))
         self._learn()
         head = jobs[0]
-        if self._lost(head, facts):
-            return _single(Action("Done"))
-        verdicts: list[SkillFailure | None] = []
+        if head.target not in self._session.known_objects:
+            return _single(self._find(head.target, facts))
+        verdicts: list[SkillFailure] = []
         for arm in self._arms(head, facts):
             action = head.action(arm)
+            if self._failed_here(action):
+                continue
             verdict = self._session.assess(action)
-            verdicts.append(verdict)
-            if verdict is not None:
-                self._fruitless.append((action.to_text(), self._rehearsal.here()))
-            elif not self._failed_at(action, self._rehearsal.here()):
+            if verdict is None:
                 return self._with_companion(head, arm, jobs[1:], facts)
+            self._fruitless.append((action.to_text(), self._here()))
+            verdicts.append(verdict)
         return _single(self._approach(head, verdicts, facts))
+
+    # ---- memory
+
+    def _here(self) -> _Place:
+        return _Place(self._session.body.commanded_base(), self._session.body.pelvis_height_m)
+
+    def _failed_here(self, action: Action) -> bool:
+        text, here = action.to_text(), self._here()
+        return any(text == other and here.near(there) for other, there in self._fruitless)
+
+    def _learn(self) -> None:
+        """Remembers what failed in the physics from where; a success changes the scene and makes all of it moot."""
+        if not self._session.history:
+            return
+        for outcome in self._session.history[-1].feedback.split("; "):
+            text, _, code = outcome.rpartition(" ")
+            if code in _FRUITLESS:
+                self._fruitless.append((text, self._here()))
+            elif code == "ok" and not text.startswith(_MOVES):
+                self._attempts.clear()
+                self._fruitless.clear()
+                self._gone.clear()
+
+    def _count(self, what: str) -> int:
+        """How often this has been tried before; counts one more."""
+        self._attempts[what] = self._attempts.get(what, 0) + 1
+        return self._attempts[what] - 1
 
     def _lost(self, job: Job, facts: Facts) -> bool:
         """Whether the job's object lies on the floor, where neither robot reaches, or is broken."""
@@ -114,27 +166,7 @@ class Expert:
             return False
         return bool(entry["isBroken"]) or (not entry["parentReceptacles"] and entry["center"]["z"] < _FLOOR_M)
 
-    def _learn(self) -> None:
-        """Remembers what failed in the physics from where: trying it again from there would fail again."""
-        history = self._session.history
-        if not history:
-            return
-        for outcome in history[-1].feedback.split("; "):
-            text, _, code = outcome.rpartition(" ")
-            if code in _FRUITLESS:
-                self._fruitless.append((text, self._rehearsal.here()))
-            elif code == "ok" and not text.startswith(_MOVES):
-                self._attempts.clear()
-                self._fruitless.clear()
-
-    def _failed_at(self, action: Action, place: Place) -> bool:
-        """Whether the action has already failed in the physics from (about) there."""
-        text = action.to_text()
-        return any(text == other and place.near(there) for other, there in self._fruitless)
-
-    def step(self, observation: object = None, feedback: object = None) -> PlanStep:
-        """The planner interface; what it is shown does not matter to it."""
-        return self.next_step()
+    # ---- arms
 
     def _arms(self, job: Job, facts: Facts) -> tuple[Arm | None, ...]:
         """Arms that may do the job, preferred one first: the one on the target's side, the right one straight ahead."""
@@ -152,68 +184,80 @@ class Expert:
         if arm is None:
             return _single(head.action(None))
         for job in others:
+            if job.verb in ("Lift", "PlaceBoth") or job.target not in self._session.known_objects or self._is_far(job.target):
+                continue
             pairs = [(arm, arm.other)]
             if head.arm is None and job.arm is None and len(facts.free_arms()) == 2:
                 pairs.append((arm.other, arm))
-                if self._bearing_rad(head.target) < self._bearing_rad(job.target) and arm is Arm.LEFT:
-                    pairs.reverse()
+                left_first = self._bearing_rad(head.target) > self._bearing_rad(job.target)
+                pairs.sort(key=lambda pair: (pair[0] is Arm.LEFT) != left_first)
             for mine, other in pairs:
-                if job.verb in ("Lift", "PlaceBoth") or job.arm not in (None, other) or head.arm not in (None, mine):
-                    continue
-                if job.arm is None and other not in facts.free_arms():
+                if job.arm not in (None, other) or (job.arm is None and other not in facts.free_arms()):
                     continue
                 first, second = head.action(mine), job.action(other)
-                if all(self._session.assess(action) is None for action in (first, second)):
+                if any(self._failed_here(action) for action in (first, second)):
+                    continue
+                if all(self._session.assess(action) is None for action in (second, first)):
                     return PlanStep((first, second))
         return _single(head.action(arm))
 
-    def _approach(self, job: Job, verdicts: Sequence[SkillFailure | None], facts: Facts) -> Action:
-        """The body action that brings an unreachable target into reach."""
-        target, known = job.target, self._session.known_objects
-        if target not in known:
-            carrier = next((c for c in facts.objects[target]["parentReceptacles"] or () if c in known), None)
-            attempt = self._attempts.get(f"find {target}", 0)
-            self._attempts[f"find {target}"] = attempt + 1
-            if attempt == 0 and carrier is not None:
-                return Action("GoTo", object_id=carrier)
-            return self._look_for(target, attempt)
-        arms = self._arms(job, facts)
-        wrong = next((v for v in verdicts if v is not None and v.code in _WRONG_HEIGHT), None)
-        if wrong is not None or None in verdicts:
-            height = self._rehearsal.height_for(job, arms, None, self._failed_at)
-            if height is not None:
-                return self._height_change(height - self._session.body.pelvis_height_m)
-        attempt = self._attempts.get(target, 0)
-        self._attempts[target] = attempt + 1
-        if attempt > _PATIENCE:
-            return Action("Done")
-        for distance, bearing in _STANCES[: _REHEARSED * (attempt + 1)]:
-            action = Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
-            stance = self._rehearsal.stance_of(action)
-            if stance is None or (attempt and self._rehearsal.is_here(stance)):
-                continue
-            if self._rehearsal.height_for(job, arms, stance, self._failed_at) is not None:
-                return action
-        distance, bearing = _STANCES[attempt % len(_STANCES)]
-        return Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
+    # ---- the body
 
-    def _look_for(self, target: str, attempt: int) -> Action:
-        """Turns towards an object that is near but not yet seen; backs off when it should be in view already."""
+    def _approach(self, job: Job, verdicts: Sequence[SkillFailure], facts: Facts) -> Action:
+        """The body action that brings a known target into reach."""
+        target = job.target
+        wrong = next((verdict for verdict in verdicts if verdict.code in _WRONG_HEIGHT), None)
+        if wrong is not None and self._count(f"height {target}") < _HEIGHT_TRIALS:
+            return self._height_change(wrong.margins["height_m"])
+        self._attempts.pop(f"height {target}", None)
+        attempt = self._count(f"stance {target}")
+        if attempt >= len(_STANCES):
+            return Action("Done")
+        actions = [job.action(arm) for arm in self._arms(job, facts)]
+        options = [Action("GoTo", object_id=target, amount=d, bearing_deg=b) for d, b in _STANCES]
+        tried = self._gone.setdefault(target, set())
+        for option in options:
+            stance = self._rehearsal.stance_of(option)
+            if stance is None or option.to_text() in tried:
+                continue
+            if self._rehearsal.works(actions, stance):
+                tried.add(option.to_text())
+                return option
+        option = next((option for option in options if option.to_text() not in tried), options[attempt])
+        tried.add(option.to_text())
+        return option
+
+    def _height_change(self, height_m: float) -> Action:
+        """The change of pelvis height, rounded away from zero to the grid, as far as the legs go."""
+        low, high = self._session.body.spec.pelvis_height_range_m
+        present = self._session.body.pelvis_height_m
+        room = high - present if height_m > 0 else present - low
+        steps = max(1, int(np.ceil(abs(height_m) / HEIGHT_STEP_M - 0.1)))
+        amount = max(0.01, round(min(steps * HEIGHT_STEP_M, room), 2))
+        return Action("MoveUp" if height_m > 0 else "MoveDown", amount=amount)
+
+    def _find(self, target: str, facts: Facts) -> Action:
+        """Goes to where an object is that the robot has not seen yet, and looks around there."""
+        known = self._session.known_objects
+        carrier = next((c for c in facts.objects[target]["parentReceptacles"] or () if c in known), None)
+        attempt = self._count(f"find {target}")
+        if attempt == 0 and carrier is not None:
+            return Action("GoTo", object_id=carrier)
+        if attempt > _LOOKS:
+            return Action("Done")
         bearing_deg = float(np.rad2deg(self._bearing_rad(target)))
         if abs(bearing_deg) > 10.0 and attempt % 2 == 1:
             amount = float(np.clip(round(abs(bearing_deg) / _TURN_STEP_DEG), 1, 12)) * _TURN_STEP_DEG
             return Action("RotateLeft" if bearing_deg > 0 else "RotateRight", amount=amount)
-        return Action("MoveBack", amount=0.3) if attempt % 3 else Action("MoveDown", amount=0.2)
-
-    def _height_change(self, height_m: float) -> Action:
-        """The change of pelvis height on the grid."""
-        steps = max(1, round(abs(height_m) / HEIGHT_STEP_M))
-        return Action("MoveUp" if height_m > 0 else "MoveDown", amount=round(steps * HEIGHT_STEP_M, 2))
+        return Action("MoveBack", amount=0.3) if attempt % 3 else Action("MoveUp", amount=0.2)
 
     def _bearing_rad(self, object_id: str) -> float:
         base = self._session.body.base()
-        delta = self._session.body.world_position(object_id)[:2] - base.position
+        delta = self._session.body.interaction_point(object_id)[:2] - base.position
         return wrap_angle(float(np.arctan2(delta[1], delta[0])) - base.yaw_rad)
+
+    def _is_far(self, object_id: str) -> bool:
+        return self._session.world.distance_to(object_id) > _FAR_M
 
 
 def _single(action: Action) -> PlanStep:

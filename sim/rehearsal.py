@@ -1,63 +1,35 @@
-"""Asks, without moving anything, whether an arm action would be tried from another stance or at another pelvis height.
+"""Asks, without moving anything, from which stance and pelvis height an arm action would be tried.
 
 The robot is put there kinematically on the live world, the simulator's own reach test is asked, and the world is restored
-exactly.
-Privileged: only the expert uses it. Paper: none; it makes the feasibility certificates of tasks cheap.
+exactly. Privileged: only the expert uses it. Paper: none; it keeps the expert's plans short.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Final
 
 import mujoco
 import numpy as np
 
 from data.records import Action, Arm
-from sim.failures import FailureCode, SkillFailure
-from sim.navigation import Stance, wrap_angle
+from sim.navigation import Stance
 from sim.session import Session
 from sim.skills.locomotion import best_stance
-from sim.tasks.jobs import Job
 
-__all__ = ["HEIGHT_STEP_M", "Place", "Rehearsal"]
+__all__ = ["HEIGHT_STEP_M", "Rehearsal"]
 
+#: Grid of the expert's height changes.
 HEIGHT_STEP_M: Final = 0.05
-_MAX_HEIGHTS: Final = 5
-_NEAR_M: Final = 0.03
-_NEAR_RAD: Final = np.deg2rad(4.0)
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Where the robot stands and how high its pelvis is."""
-
-    stance: Stance
-    height_m: float
-
-    def near(self, other: Place) -> bool:
-        """Whether two places differ by less than the servos' and the grid's tolerance."""
-        gap = float(np.linalg.norm(self.stance.position - other.stance.position))
-        turn = abs(wrap_angle(self.stance.yaw_rad - other.stance.yaw_rad))
-        return gap < _NEAR_M and turn < _NEAR_RAD and abs(self.height_m - other.height_m) < 0.5 * HEIGHT_STEP_M
+_HEIGHTS: Final = 4
 
 
 class Rehearsal:
     """Questions to one session."""
 
     def __init__(self, session: Session) -> None:
+        """Attaches to a session."""
         self._session = session
-
-    def here(self) -> Place:
-        """Where the robot is."""
-        body = self._session.body
-        return Place(body.commanded_base(), body.pelvis_height_m)
-
-    def is_here(self, stance: Stance) -> bool:
-        """Whether the robot already stands there."""
-        here = self.here()
-        return Place(stance, here.height_m).near(here)
 
     def stance_of(self, action: Action) -> Stance | None:
         """Where GoTo would end, None when it would be refused."""
@@ -75,67 +47,44 @@ class Rehearsal:
         )
         return None if found is None else found[0]
 
-    def height_for(
-        self,
-        job: Job,
-        arms: Sequence[Arm | None],
-        stance: Stance | None,
-        failed: Callable[[Action, Place], bool],
-    ) -> float | None:
-        """The pelvis height nearest to the present one at which some arm would do the job.
+    def works(self, actions: Sequence[Action], stance: Stance) -> bool:
+        """Whether one of the actions would be tried from a stance, at the present pelvis height or another one.
 
         Args:
-            job: what is to be done.
-            arms: arms that may do it.
-            stance: from where; None is here.
-            failed: whether an action is known to fail from a place.
-
-        Returns:
-            A height on the grid of changes from the present one, None when there is none.
+            actions: the same action for different arms.
+            stance: where the robot would stand.
         """
-        here = self.here()
-        where = here.stance if stance is None else stance
-        saved = self._session.world.save()
-        queue, tried = [0], set[int]()
+        world, body = self._session.world, self._session.body
+        height = body.pelvis_height_m
+        saved = world.save()
+        body.hurried = True
         try:
-            while queue and len(tried) < _MAX_HEIGHTS:
-                steps = queue.pop(0)
-                height = self._height(here.height_m, steps)
-                if height is None or steps in tried:
-                    continue
-                tried.add(steps)
-                place = Place(where, height)
-                self._put(place)
-                hints: list[int] = []
-                for arm in arms:
-                    action = job.action(arm)
-                    verdict = None if failed(action, place) else self._session.assess(action)
-                    if verdict is None and not failed(action, place):
-                        return height
-                    hints += self._hints(verdict, steps)
-                queue = hints + queue
+            for candidate in self._heights(actions, stance, height):
+                self._put(stance, candidate)
+                if any(self._session.assess(action) is None for action in actions):
+                    return True
         finally:
-            self._session.world.restore(saved)
-        return None
+            body.hurried = False
+            world.restore(saved)
+        return False
 
-    @staticmethod
-    def _hints(verdict: SkillFailure | None, steps: int) -> list[int]:
-        """Heights worth trying after a refusal, as steps of change from the present one."""
-        if verdict is not None and verdict.code is FailureCode.TOO_FAR:
-            return []
-        if verdict is not None and "height_m" in verdict.margins:
-            change = verdict.margins["height_m"] / HEIGHT_STEP_M
-            first = steps + int(np.sign(change) * np.ceil(abs(change) - 1e-6))
-            return [first, first + int(np.sign(change))]
-        return [steps - 1, steps + 1, steps - 2, steps + 2]
+    def _heights(self, actions: Sequence[Action], stance: Stance, present_m: float) -> list[float]:
+        """The present height and the nearest ones at which the target is within the arms' envelope."""
+        body = self._session.body
+        low, high = body.spec.pelvis_height_range_m
+        steps = sorted(range(-8, 9), key=lambda step: (abs(step), step))
+        grid = [present_m + step * HEIGHT_STEP_M for step in steps]
+        grid = [height for height in grid if low - 0.001 <= height <= high + 0.001]
+        first = actions[0]
+        assert first.object_id is not None
+        if first.arm is None or first.name == "Place":
+            return grid[:_HEIGHTS]
+        point = body.interaction_point(first.object_id)
+        self._put(stance, present_m)
+        within = [h for h in grid if any(a.arm is not None and body.within(a.arm, point, h) for a in actions)]
+        return within[:_HEIGHTS]
 
-    def _height(self, present_m: float, steps: int) -> float | None:
-        """The height that so many steps of MoveUp (positive) or MoveDown lead to, None beyond the legs' range."""
-        low, high = self._session.body.spec.pelvis_height_range_m
-        height = present_m + steps * HEIGHT_STEP_M
-        return float(np.clip(height, low, high)) if low - 0.004 <= height <= high + 0.004 else None
-
-    def _put(self, place: Place) -> None:
+    def _put(self, stance: Stance, height_m: float) -> None:
         """Moves robot and load rigidly; the legs follow the height."""
         world, body = self._session.world, self._session.body
         model, data = world.model, world.data
@@ -143,8 +92,8 @@ class Rehearsal:
         loads = {name: arm for arm, name in names.items() if name is not None and world.objects[name].movable}
         hands = {arm: world.grasp_pose(arm.value) for arm in loads.values()}
         poses = {name: world.pose(name) for name in loads}
-        body.command_base(place.stance.x, place.stance.y, place.stance.yaw_rad)
-        body.command_height(place.height_m)
+        body.command_base(stance.x, stance.y, stance.yaw_rad)
+        body.command_height(height_m)
         for joint in (*body.spec.leg_joints, "base_x", "base_y", "base_z", "base_yaw", "base_pitch"):
             data.qpos[model.joint(joint).qposadr[0]] = data.ctrl[model.actuator(joint).id]
         mujoco.mj_kinematics(model, data)

@@ -113,6 +113,8 @@ class Body:
         self._waist_ids = np.array([self._actuators[name] for name in self.spec.waist_joints])
         self._columns = {arm: kit.model.indices(self.spec.arms[arm.value].joints) for arm in Arm}
         self.considered_height_m: float | None = None
+        #: Whether a refusal may stay unexplained: no other pelvis heights are tried to find its reason.
+        self.hurried = False
         self._vias: dict[Arm, tuple[Array, ...]] = {}
         self.probe = ClearanceProbe(world, self)
 
@@ -543,7 +545,9 @@ def ready_posture(robot_name: str, arm: Arm, raised: bool = False) -> Array:
     """See `Body.ready` and `Body.carrying`; solved once per robot and arm."""
     kit, reach_map = robot_kit(robot_name), reach_maps(robot_name)[arm.value]
     inward = np.array([0.0, -1.0 if arm is Arm.LEFT else 1.0, 0.0])
-    point = reach_map.shoulder + reach_map.reach_m * np.array([0.3, 0.0, 0.16] if raised else [0.3, 0.0, -_READY_DROP])
+    ahead = min(0.3 * reach_map.reach_m, kit.spec.footprint_radius_m - 0.06)  # the disc that navigation keeps free
+    drop = -0.16 if raised else _READY_DROP
+    point = np.array([ahead, reach_map.shoulder[1], reach_map.shoulder[2] - drop * reach_map.reach_m])
     wish = HandPose(point, np.array([1.0, 0.0, 0.0]), inward)
     solver = PerArmSolver(kit.model, kit.crouches)
     columns = kit.model.indices(kit.spec.arms[arm.value].joints)
@@ -551,15 +555,25 @@ def ready_posture(robot_name: str, arm: Arm, raised: bool = False) -> Array:
     root = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     rotation = wish.rotation(wish.pointing, inward) if wish.pointing is not None else np.eye(3)
     height = kit.spec.standing_pelvis_height_m
+    elbow = kit.spec.key_bodies[f"{arm.value}_elbow"]
+    tip_m = hand_shape(robot_name).tip_m
     best: tuple[float, Array] | None = None
-    for start in reach_map.starts(wish, 12, radius_m=0.2, near=np.array(kit.spec.arms[arm.value].carry)):
+    for start in reach_map.starts(wish, 60, radius_m=0.15, near=np.array(kit.spec.arms[arm.value].carry)):
         q = kit.model.posture()
         q[columns] = start
         target = ReachTarget(point, rotation, 0.3, 0.2)
         result = solver.solve({arm.value: target}, q, pelvis_height_m=height, restarts=0)
-        hand = kit.model.frames(root, result.q, site)[0, :3, :3]
+        hand, joint = kit.model.frames(root, result.q, (*site, elbow))
         away = result.q[columns] - kit.spec.arms[arm.value].carry
-        cost = 5.0 * result.position_error_m + 2.0 - float(hand[0, 0]) - float(hand[:, 1] @ inward) + 0.05 * float(away @ away)
+        # what reaches ahead must be above worktops: the elbow, and the fingers unless they point up
+        low = max(float(joint[0, 3]) - 0.02, float(hand[0, 3] + tip_m * hand[0, 0]) - 0.3 + float(hand[2, 0]) * 0.1)
+        cost = (
+            5.0 * result.position_error_m
+            + 0.5 * (1.0 - float(hand[0, 0]))
+            + (1.0 - float(hand[:3, 1] @ inward))
+            + 0.04 * float(away @ away)
+            + 6.0 * max(low, 0.0)
+        )
         if best is None or cost < best[0]:
             best = (cost, result.q[columns].copy())
     assert best is not None

@@ -58,6 +58,8 @@ def blame(body: Body, points: Mapping[Arm, Array], plan: Callable[[], object]) -
         points: what each arm reaches for, world frame.
         plan: plans at the height under consideration; raises SkillFailure when it cannot.
     """
+    if body.hurried:
+        return SkillFailure(FailureCode.OBSTRUCTED)
     present = body.pelvis_height_m
     common = [height for height in body.heights() if all(body.within(arm, p, height) for arm, p in points.items())]
     gap = max(max(body.maps[a.value].beyond_m(body.in_trunk(p)), body.maps[a.value].gap_m(body.in_trunk(p))) for a, p in points.items())
