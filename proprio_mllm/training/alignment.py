@@ -82,10 +82,9 @@ class AlignmentData:
         return self._collator([self._motion_text(kind, int(i), code, rng) for i, code in zip(rows, codes, strict=True)])
 
     def _plan(self, index: int, rng: np.random.Generator) -> Example:
-        codes = self._demo_tokens[index].tolist()
         if rng.random() < self._cfg.judge_share:
-            return judge_example(self.demos, index, rng, codes)
-        return self.demos.example(index, codes)
+            return judge_example(self.demos, index, rng, self._demo_tokens)
+        return self.demos.example(index, self._demo_tokens[index].tolist())
 
     def _motion_text(self, kind: Kind, clip: int, codes: Sequence[int], rng: np.random.Generator) -> Example:
         caption = self.clips.caption(clip, rng)

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data.records import Action, ActionError, HistoryItem
 from proprio_mllm.model.batch import Example
@@ -77,17 +78,25 @@ def states_from_log(history: Sequence[HistoryItem]) -> dict[str, tuple[str, ...]
     return {name: tuple(things) for name, things in found.items()}
 
 
-def judge_example(demos: Demos, index: int, rng: np.random.Generator, motion: Sequence[int] | None) -> Example:
+def judge_example(demos: Demos, index: int, rng: np.random.Generator, tokens: NDArray[np.int64] | None) -> Example:
     """A judging conversation about the state before expert step `index`, with its answer.
 
     Half of them ask whether a goal was completed: the episode's own, which is so after its last step only, or another
     episode's instruction; the others ask which objects are in a relation. The view after the last step is not recorded: the
     one before it stands in, with the last step in the log.
+
+    Args:
+        demos: expert steps.
+        index: a training row.
+        rng: draws the question, and whether the end of another episode is asked about.
+        tokens: motion tokens (rows, tokens) of all rows, None leaves proprioception out.
     """
-    row, style = demos.reader[int(index)], demos.style
+    style = demos.style
     ended = rng.random() < 0.6 and len(demos.finals) > 0
     if ended:
-        row = demos.reader[int(rng.choice(demos.finals))]
+        index = int(rng.choice(demos.finals))
+    row = demos.reader[int(index)]
+    motion = None if tokens is None else tokens[int(index)].tolist()
     history = _history(row)
     if ended:
         history.append(HistoryItem(row["target"], "; ".join(f"{part.strip()} ok" for part in row["target"].split("&"))))

@@ -152,7 +152,7 @@ class _Selu:
 
     def _judging(self, rng: np.random.Generator) -> Example:
         index = int(rng.choice(self.demos.split.train))
-        return judge_example(self.demos, index, rng, self._codes(index))
+        return judge_example(self.demos, index, rng, self._tokens)
 
     def _planning(self, rng: np.random.Generator) -> Example:
         index = int(rng.choice(self.demos.split.train))
