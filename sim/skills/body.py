@@ -209,15 +209,18 @@ class Body:
         return self.world_position(object_id)
 
     def faces_rad(self, object_id: str) -> tuple[float, ...]:
-        """World directions out of an object in which a robot stands well: its front, or all sides of what two hands lift."""
+        """World directions out of an object in which a robot stands well: square to what carries it, or to its own sides."""
         thing = self.thing(object_id)
-        front = self.world.front(object_id)
+        square = thing
+        if thing.movable and not self.world.needs_two_hands(object_id):
+            carriers = self.world.parents(object_id)
+            if not carriers:
+                return ()
+            square = self.thing(carriers[-1])
+        front = self.world.front(square.object_id)
         angle = float(np.arctan2(front[1], front[0]))
-        if thing.movable:
-            return tuple(angle + k * np.pi / 2.0 for k in range(4)) if self.world.needs_two_hands(object_id) else ()
-        if any(surface.spec.all_sides for surface in thing.surfaces):
-            return ()
-        return (angle,)
+        sides = square.movable or any(surface.spec.all_sides for surface in square.surfaces)
+        return tuple(angle + k * np.pi / 2.0 for k in range(4)) if sides else (angle,)
 
     def rests(self, thing: ObjectInstance) -> bool:
         """Whether an object touches something that is not part of the robot, from above."""
@@ -456,11 +459,12 @@ class Body:
         return self.maps[arm.value].contains(self.in_trunk(point, pelvis_height_m))
 
     def vias(self, arm: Arm) -> tuple[Array, ...]:
-        """(A,) postures that lead around furniture edges: the ready one, and the hand forward at shoulder height."""
+        """(A,) postures that lead around furniture edges: ready, hand forward at shoulder height, hand above the shoulder."""
         if arm not in self._vias:
             reach_map = self.maps[arm.value]
             high = reach_map.shoulder + reach_map.reach_m * np.array([0.6, 0.0, -0.05])
-            self._vias[arm] = (self.ready(arm), reach_map.starts(HandPose(high, np.array([1.0, 0.0, 0.0])), 1, near=self.ready(arm))[0])
+            forward = reach_map.starts(HandPose(high, np.array([1.0, 0.0, 0.0])), 1, near=self.ready(arm))[0]
+            self._vias[arm] = (self.ready(arm), forward, ready_posture(self.spec.name, arm, raised=True))
         return self._vias[arm]
 
     # ---- motions

@@ -91,7 +91,7 @@ def route(
             shares = np.linspace(0.0, 1.0, 2 + int(np.max(np.abs(b - a)) / _PATH_STEP_RAD))
             depths = body.probe.depths_m(arm, a + shares[:, None] * (b - a), ignore, opening)
             # an arm that touches something at the start may do so until it has come away from it
-            excess = depths - depths[0] * (1.0 - 0.8 * shares) if number == 0 else depths
+            excess = depths - depths[0] * np.maximum(1.0 - 3.0 * shares, 0.0) if number == 0 else depths
             worst = max(worst, float(excess.max()))
         if worst <= TOUCH_M:
             return () if via is None else (via,)
