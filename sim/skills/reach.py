@@ -26,8 +26,10 @@ Array = NDArray[np.float64]
 #: How well the fingers must agree with the wished directions (cosines) for a grasp to be tried.
 MIN_POINTING: Final = 0.75
 MIN_CLOSING: Final = 0.8
-_PATH_STEP_RAD: Final = 0.12
-_SLIDE_M: Final = 0.012
+_PATH_STEP_RAD: Final = 0.1
+#: Penetration on the way that is no obstacle, and the most that is tried when there is no better way: an edge catches a hand.
+_GRAZE_M: Final = 0.002
+_SLIDE_M: Final = 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +95,10 @@ def route(
             # an arm that touches something at the start may do so until it has come away from it
             excess = depths - depths[0] * np.maximum(1.0 - 3.0 * shares, 0.0) if number == 0 else depths
             worst = max(worst, float(excess.max()))
-        if worst <= TOUCH_M:
+        if worst <= _GRAZE_M:
             return () if via is None else (via,)
         if best is None or worst < best[0]:
             best = (worst, () if via is None else (via,))
-    # The hand may slide along what it touches lightly; the servos give way.
     return best[1] if best is not None and best[0] <= _SLIDE_M else None
 
 
