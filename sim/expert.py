@@ -30,6 +30,9 @@ _STANCES: Final[tuple[tuple[float | None, float | None], ...]] = (
     (None, None), (None, -20.0), (None, 20.0), (0.5, None), (0.4, None), (0.6, None), (0.5, -30.0), (0.5, 30.0),
 )  # fmt: skip
 _TURN_STEP_DEG: Final = 15.0
+#: Stances that are tried in thought before each walk, and walks before the expert gives up.
+_REHEARSED: Final = 4
+_PATIENCE: Final = 5
 #: Changes of height that are tried at one stance before another stance is.
 _HEIGHT_TRIALS: Final = 2
 #: Looks around for an object that should be near, before giving up.
@@ -211,19 +214,18 @@ class Expert:
             return self._height_change(wrong.margins["height_m"])
         self._attempts.pop(f"height {target}", None)
         attempt = self._count(f"stance {target}")
-        if attempt >= len(_STANCES):
+        if attempt >= _PATIENCE:
             return Action("Done")
         actions = [job.action(arm) for arm in self._arms(job, facts)]
         options = [Action("GoTo", object_id=target, amount=d, bearing_deg=b) for d, b in _STANCES]
         tried = self._gone.setdefault(target, set())
-        for option in options:
+        fresh = [option for option in options if option.to_text() not in tried]
+        for option in fresh[:_REHEARSED]:
             stance = self._rehearsal.stance_of(option)
-            if stance is None or option.to_text() in tried:
-                continue
-            if self._rehearsal.works(actions, stance):
+            if stance is not None and self._rehearsal.works(actions, stance):
                 tried.add(option.to_text())
                 return option
-        option = next((option for option in options if option.to_text() not in tried), options[attempt])
+        option = fresh[0] if fresh else options[0]
         tried.add(option.to_text())
         return option
 

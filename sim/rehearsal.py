@@ -21,7 +21,7 @@ __all__ = ["HEIGHT_STEP_M", "Rehearsal"]
 
 #: Grid of the expert's height changes.
 HEIGHT_STEP_M: Final = 0.05
-_HEIGHTS: Final = 4
+_HEIGHTS: Final = 3
 
 
 class Rehearsal:

@@ -29,6 +29,7 @@ __all__ = [
     "read_tasks",
     "tasks_text",
     "write_tasks",
+    "write_text",
 ]
 
 BENCHMARK_PATH: Final = Path(__file__).parent / "benchmark.jsonl"
@@ -178,8 +179,13 @@ class Task:
 
 def write_tasks(tasks: Iterable[Task], path: Path) -> None:
     """Writes one JSON object per line, atomically and byte-stable."""
+    write_text(tasks_text(tasks), path)
+
+
+def write_text(text: str, path: Path) -> None:
+    """Writes a text file atomically."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(tasks_text(tasks), encoding="utf-8")
+    temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
 
 
