@@ -335,6 +335,15 @@ class Body:
         site = self._site[arm]
         return self.world.data.site_xpos[site].copy(), self.world.data.site_xmat[site].reshape(3, 3).copy()
 
+    def hand_at(self, arm: Arm, q: Array) -> Array:
+        """(3,) world position of the grasp site with an arm posture, from the commanded base."""
+        full = self.kinematics.posture()
+        full[self._columns[arm]] = q
+        root = np.array([0.0, 0.0, 0.0, *_quaternion_about_y(self.crouches.pitch(self.pelvis_height_m))])
+        base = self.commanded_base()
+        local = self.kinematics.frames(root, full, (self.spec.arms[arm.value].grasp_site,))[0, :3, 3]
+        return self.turn_to_world(local) + (base.x, base.y, self.pelvis_height_m)
+
     def commanded_arm(self, arm: Arm) -> Array:
         """(A,) commanded arm joints."""
         return self.world.data.ctrl[self._arm_ids[arm]].copy()

@@ -38,7 +38,7 @@ class HandShape:
 
 #: Hands by robot, measured on their MJCF. H1: palm 38 mm behind the site, thumb opposite at a slant. X1: parallel pads.
 _HANDS: Final = {
-    "h1": HandShape(0.04, 0.055, 0.1, 0.045, slope=(1.9, -0.055), pinch_m=0.013, clearance_m=0.012),
+    "h1": HandShape(0.04, 0.055, 0.1, 0.045, slope=(1.9, -0.055), pinch_m=0.011, clearance_m=0.012),
     "x1": HandShape(0.058, 0.054, 0.042, 0.016),
 }
 

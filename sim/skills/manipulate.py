@@ -83,10 +83,25 @@ def _find_grasp(body: Body, arm: Arm, thing: ObjectInstance, limit: int) -> tupl
 def stow(body: Body, arm: Arm, ignore: tuple[str | int, ...] = ()) -> Skill:
     """Brings the arm to its ready posture, or to the carrying one with something in the hand, around what is in the way."""
     held = body.held[arm]
-    goal = body.ready(arm) if held is None or not body.thing(held).movable else body.carrying(arm)
+    goal = body.ready(arm) if held is None or not body.thing(held).movable else _carry(body, arm, held)
     way = route(body, arm, body.commanded_arm(arm), goal, ignore)
     vias = way if way is not None else tuple(body.vias(arm))[:1]
     yield from body.move_arm(arm, [*vias, goal])
+
+
+def _carry(body: Body, arm: Arm, held: str) -> Array:
+    """(A,) carrying posture with the hand turned so that the object stands as upright as the arm can hold it."""
+    usual = body.carrying(arm)
+    _, hand = body.hand_pose(arm)
+    turn = _upright(body.world.pose(held)[:3, :3])
+    pointing, closing = turn @ hand[:, 0], turn @ hand[:, 1]
+    ahead = body.turn_to_world(np.array([1.0, 0.0, 0.0]))
+    if np.hypot(*pointing[:2]) > 0.15:
+        about = _turn_z(float(np.arctan2(ahead[1], ahead[0]) - np.arctan2(pointing[1], pointing[0])))
+        pointing, closing = about @ pointing, about @ closing
+    place_at = body.hand_at(arm, usual)
+    solved = body.solve(arm, HandPose(place_at, pointing, closing), start=usual, roll_weight=0.2)
+    return solved.q if solved.error_m < 0.05 else usual
 
 
 def _close(body: Body, arm: Arm, geoms: NDArray[np.int64]) -> Skill:
@@ -304,8 +319,8 @@ def _upright(rotation: Array) -> Array:
     """The smallest rotation that makes the object's z axis vertical again."""
     axis = np.cross(rotation[:, 2], _UP)
     sine, cosine = float(np.linalg.norm(axis)), float(rotation[2, 2])
-    if sine < 1e-6 or cosine < 0.3:  # upright already, or lying: leave it as it is
-        return np.eye(3)
+    if sine < 1e-6:  # upright, or upside down about an axis that does not matter
+        return np.eye(3) if cosine > 0.0 else np.diag([1.0, -1.0, -1.0])
     x, y, z = axis / sine
     k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + sine * k + (1.0 - cosine) * (k @ k)
