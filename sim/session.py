@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import mujoco
 import numpy as np
 
 from data.records import Action, ActionKind, ActionOutcome, Arm, Feedback, HistoryItem, Observation, PlanStep
@@ -254,6 +255,15 @@ class Session:
         """Why an action would be refused right now, None when it would be tried. Moves nothing; for the privileged expert."""
         return assess_action(self.body, action, frozenset(self.known_objects))
 
+    def teleport(self, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Puts the base somewhere at once. Privileged; not an action of the grammar, and no part of any planner's episode."""
+        data, model = self.world.data, self.world.model
+        for name, value in (("base_x", x_m), ("base_y", y_m), ("base_yaw", yaw_rad)):
+            data.qpos[model.joint(name).qposadr[0]] = value
+            data.qvel[model.joint(name).dofadr[0]] = 0.0
+        self.world.set_base_target(x=x_m, y=y_m, yaw=yaw_rad)
+        mujoco.mj_forward(model, data)
+
     # ---- views
 
     def observation(self) -> Observation:
@@ -284,6 +294,11 @@ class Session:
     def succeeded(self) -> bool:
         """Whether there are goals and all of them hold."""
         return bool(self.task.goals) and all(self.goal_status())
+
+    @property
+    def ended(self) -> bool:
+        """Whether the planner has said Done."""
+        return self._ended
 
     @property
     def finished(self) -> bool:

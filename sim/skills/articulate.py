@@ -24,7 +24,7 @@ from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
 from sim.skills.grasps import hand_shape
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
-from sim.skills.reach import Reach, blame, plan_reach
+from sim.skills.reach import Reach, blame, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.trajectory import min_jerk
@@ -228,12 +228,19 @@ def assess_toggle(body: Body, action: Action) -> Reach:
     arm, thing = action.arm, body.thing(action.object_id)
     check_toggle(body, arm, thing, action.name == "ToggleOn")
     switch = body.world.toggle_point(thing.object_id)
-    tip = hand_shape(body.spec.name).tip_m
+    ahead, aside, opening = hand_shape(body.spec.name).press
 
     def search() -> Reach:
         for pointing in _pointings(body, arm, switch):
-            wish = HandPose(switch - (tip - 0.006) * pointing, pointing)
-            reach = plan_reach(body, arm, wish, -pointing, 0.07, (thing.object_id,), pointing=0.85)
+            first = body.solve(arm, HandPose(switch - ahead * pointing, pointing))
+            if not fulfils(first, pointing=0.8):
+                continue
+            # the fingertip, as the hand will really be turned, belongs on the switch
+            site = switch - ahead * first.pointing - aside * first.closing
+            wish = HandPose(site, first.pointing, first.closing)
+            reach = plan_reach(
+                body, arm, wish, -first.pointing, 0.07, (thing.object_id,), 0.95, 0.9, opening=opening, start=first.q
+            )
             if reach is not None:
                 return reach
         raise SkillFailure(FailureCode.OBSTRUCTED)
@@ -254,6 +261,7 @@ def toggle(body: Body, action: Action, luck: Luck) -> Skill:
     arm = action.arm
     assert arm is not None and action.object_id is not None
     thing = body.thing(action.object_id)
+    yield from body.move_hand(arm, hand_shape(body.spec.name).press[2], 0.2)
     yield from body.move_arm(arm, [*reach.way, reach.before])
     yield from body.move_arm(arm, [reach.at], speed=0.7)
     yield from wait(0.1)
@@ -262,6 +270,7 @@ def toggle(body: Body, action: Action, luck: Luck) -> Skill:
     if gap <= GRASP_GAP_M and outcome == "success":
         body.world.set_state(thing.object_id, "isToggled", action.name == "ToggleOn")
     yield from body.move_arm(arm, [reach.before])
+    yield from body.move_hand(arm, 1.0, 0.2)
     yield from stow(body, arm)
     if gap > GRASP_GAP_M:
         raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": gap})

@@ -237,11 +237,14 @@ class Body:
         """Free spots (3,) on a receptacle for an object, the ones the arm reaches most easily first."""
         easy = self.easy_point(arm)
         spots: list[Array] = []
+        # What two hands carry is held with its long side across: its narrow side may be flush with the edge.
+        narrow = 0.5 * float(np.min(thing.local_max[:2] - thing.local_min[:2]))
+        radius = thing.footprint_radius_m if arm is not None else narrow
         for gap in (0.04, 0.01):
             for dx, dy in ((0.0, 0.0), (0.0, 0.12), (0.0, -0.12), (0.1, 0.0), (-0.1, 0.0), (0.0, 0.25), (0.0, -0.25), (0.15, 0.0)):
                 near = easy[:2] + self.turn_to_world(np.array([dx, dy, 0.0]))[:2]
                 spot = self.world.free_spot(
-                    receptacle.object_id, thing.footprint_radius_m, height_m=thing.height_m, near=near, gap_m=gap,
+                    receptacle.object_id, radius, height_m=thing.height_m, near=near, gap_m=gap,
                     ignore=(thing.object_id,), band_m=10.0,
                 )  # fmt: skip
                 if spot is not None and all(float(np.linalg.norm(spot - known)) > 0.03 for known in spots):
@@ -514,6 +517,10 @@ class Body:
                 time_s += CONTROL_DT_S
                 self.world.data.ctrl[ids] = way.at(time_s)
                 yield
+
+    def hand_height(self, goal: BothGoal) -> float:
+        """Mean height of both grasp sites in a posture, metres."""
+        return float(np.mean([self.hand_at(arm, q)[2] for arm, q in goal.arms.items()]))
 
     def stow_both(self) -> Skill:
         """Both arms to their ready postures, waist straight."""

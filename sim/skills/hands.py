@@ -20,6 +20,7 @@ class HandShape:
         slope: how the thumb limits the seat: free x per metre of radius, and at radius 0; (0, 0) for parallel fingers.
         pinch_m: distance along y at which half-closed fingertips and thumb meet a surface; None when the fingers are parallel.
         clearance_m: free distance between the object and what closes from behind, on arrival.
+        press: the fingertip that presses a switch: x and y in the site's frame, and the opening of the hand for it.
     """
 
     behind_m: float
@@ -29,6 +30,7 @@ class HandShape:
     slope: tuple[float, float] = (0.0, 0.0)
     pinch_m: float | None = None
     clearance_m: float = 0.0
+    press: tuple[float, float, float] = (0.036, 0.0, 0.0)
 
     def seat(self, radius_m: float) -> tuple[float, float]:
         """Where the middle of an object of that half width belongs: x and y in the site's frame."""
@@ -38,7 +40,7 @@ class HandShape:
 
 #: Hands by robot, measured on their MJCF. H1: palm 38 mm behind the site, thumb opposite at a slant. X1: parallel pads.
 _HANDS: Final = {
-    "h1": HandShape(0.04, 0.055, 0.1, 0.045, slope=(1.9, -0.055), pinch_m=0.011, clearance_m=0.012),
+    "h1": HandShape(0.04, 0.055, 0.1, 0.045, slope=(1.9, -0.055), pinch_m=0.011, clearance_m=0.012, press=(0.094, -0.051, 1.0)),
     "x1": HandShape(0.058, 0.054, 0.042, 0.016),
 }
 

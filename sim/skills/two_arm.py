@@ -33,7 +33,7 @@ _TOLERANCE_M: Final = 0.02
 #: Tilt up to which a lifted object counts as level.
 _LEVEL_RAD: Final = 0.2
 #: Ways to hold what was lifted: metres up and towards the body, the best first.
-_HOLDS: Final = ((0.25, 0.1), (0.2, 0.06), (0.15, 0.05), (0.12, 0.0), (0.3, 0.0), (0.08, 0.0))
+_HOLDS: Final = ((0.3, 0.12), (0.3, 0.05), (0.25, 0.1), (0.25, 0.0), (0.2, 0.06), (0.2, 0.0), (0.15, 0.05), (0.12, 0.0), (0.08, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,11 +228,13 @@ def place_both(body: Body, action: Action, luck: Luck) -> Skill:
     before, at = assess_place_both(body, action)
     assert action.object_id is not None
     thing, receptacle = body.thing(body.lifted or ""), body.thing(action.object_id)
-    hold = body.commanded_both()
-    yield from body.move_both([before], speed=0.6)
+    hold, waist = body.commanded_both(), body.commanded_waist()
+    rise = max(0.0, float(body.hand_height(before) - body.hand_height(BothGoal(hold, waist, 0.0))))
+    raised = _shifted(body, rise + 0.02, 0.0)  # straight up first, over the receptacle's edge
+    yield from body.move_both([raised, before] if raised.error_m <= _TOLERANCE_M else [before], speed=0.6)
     outcome = luck(action)
     if outcome != "success":
-        yield from body.move_both([BothGoal(hold, body.commanded_waist(), 0.0)], speed=0.6)
+        yield from body.move_both([BothGoal(hold, waist, 0.0)], speed=0.6)
         raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
     for _ in body.move_both([at], speed=0.4):
         yield

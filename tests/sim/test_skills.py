@@ -1,0 +1,186 @@
+"""Skills in physics on both robots: what they achieve, and the codes of what they refuse."""
+
+import numpy as np
+import pytest
+
+from data.records import Arm, FailureCategory, PlanStep
+from sim.failures import FailureCode, SkillFailure
+from sim.objects import ObjectPlacement
+from sim.session import FreePlay, Session
+from sim.skills.body import Body
+from sim.skills.runner import refuse, run_skills
+from sim.world import World
+
+THINGS = (
+    ObjectPlacement("Mug_1", "CounterTop_1", (-1.15, 2.19)),
+    ObjectPlacement("Apple_1", "CounterTop_1", (-0.75, 2.19)),
+    ObjectPlacement("Bottle_1", "CounterTop_2", (1.5, 2.19)),
+)
+ROOM = FreePlay("kitchen_1", placements=THINGS)
+
+
+@pytest.fixture(scope="module", params=["h1", "x1"])
+def session(request):
+    made = Session(request.param, image_size=0)
+    yield made
+    made.close()
+
+
+def start(session, task=ROOM):
+    session.reset(task, 0)
+    session._seen.update(session.world.objects)
+    return session
+
+
+def act(session, text):
+    return session.act(PlanStep.parse(text)).outcomes
+
+
+def reach(session, text):
+    """Goes to the target and bends until the action is possible; then does it."""
+    action = PlanStep.parse(text).actions[0]
+    for place in ("", ", 0.45", ", 0.55"):
+        act(session, f"GoTo({action.object_id}{place})")
+        for _ in range(4):
+            refusal = session.assess(action)
+            if refusal is None:
+                return act(session, text)[0]
+            change = refusal.margins.get("height_m")
+            if change is None:
+                break
+            act(session, f"{'MoveUp' if change > 0 else 'MoveDown'}({max(abs(change), 0.03):.2f})")
+    raise AssertionError(f"{text}: {refusal}")
+
+
+def test_pick_carry_and_place(session):
+    start(session)
+    assert reach(session, "Pick(right, Mug_1)").success
+    assert session.body.held[Arm.RIGHT] == "Mug_1" and session.world.parents("Mug_1") == ()
+    assert act(session, "Pick(right, Apple_1)")[0].code == "HandOccupied"
+    assert act(session, "Pick(left, Mug_1)")[0].code == "AlreadyHeld"
+    assert reach(session, "Place(right, CounterTop_1)").success
+    assert session.body.held[Arm.RIGHT] is None and "CounterTop_1" in session.world.parents("Mug_1")
+
+
+def test_a_drawer_opens_and_closes(session):
+    start(session)
+    assert reach(session, "Open(left, Drawer_1)").success
+    assert session.world.objects["Drawer_1"].is_open
+    assert act(session, "Open(left, Drawer_1)")[0].code == "AlreadyInState"
+    assert reach(session, "Close(left, Drawer_1)").success
+    assert session.world.objects["Drawer_1"].openness < 0.07
+
+
+def test_a_switch_is_pressed(session):
+    start(session)
+    assert reach(session, "ToggleOn(left, StoveKnob_1)").success
+    assert session.world.objects["StoveKnob_1"].is_toggled and session.world.objects["StoveBurner_1"].is_toggled
+    assert act(session, "ToggleOn(left, StoveKnob_1)")[0].code == "AlreadyInState"
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("Pick(left, Fridge_1)", "NotPickupable"),
+        ("Place(left, CounterTop_1)", "HandEmpty"),
+        ("Open(left, CounterTop_1)", "NotOpenable"),
+        ("ToggleOn(left, Fridge_1)", "NotToggleable"),
+        ("Lift(Fridge_1)", "NotLiftable"),
+        ("Lift(Mug_1)", "NotLiftable"),
+        ("PlaceBoth(CounterTop_1)", "HandEmpty"),
+        ("Close(left, Fridge_1)", "AlreadyInState"),
+        ("Pick(left, Mug_1)", "TooFar"),
+        ("GoTo(Unicorn_1)", "ObjectNotKnown"),
+    ],
+)
+def test_refusals_move_nothing(session, text, code):
+    start(session)
+    outcome = act(session, text)[0]
+    assert not outcome.success and outcome.code == code
+    assert session.world.time_s == 0.0
+    assert outcome.category is (FailureCategory.NAVIGATION if code == "TooFar" else FailureCategory.LOGICAL)
+
+
+def test_moves_stop_at_obstacles(session):
+    start(session)
+    outcome = act(session, "MoveAhead(5)")[0]
+    assert outcome.code == "BlockedPath" and 0.5 < outcome.margins["travel_m"] < 5.0
+    assert session.stats.path_length_m == pytest.approx(outcome.margins["travel_m"], abs=0.05)
+
+
+def test_rotation_and_sidestep(session):
+    start(session)
+    before = session.world.base_pose.copy()
+    assert act(session, "RotateLeft(90)")[0].success and act(session, "MoveRight(0.2)")[0].success
+    after = session.world.base_pose
+    assert after[3] - before[3] == pytest.approx(np.pi / 2, abs=0.02)
+    shift = after[:2] - before[:2]
+    right = np.array([np.sin(after[3]), -np.cos(after[3])])
+    assert shift @ right == pytest.approx(0.2, abs=0.02)
+
+
+def test_pelvis_height_follows_the_legs_limits(session):
+    start(session)
+    low, high = session.robot.pelvis_height_range_m
+    outcome = act(session, "MoveDown(0.9)")[0]
+    assert outcome.code == "HeightLimit" and outcome.category is FailureCategory.BODY_ADJUSTMENT
+    assert session.world.base_pose[2] == pytest.approx(low, abs=0.01)
+    assert outcome.margins["height_m"] == pytest.approx(high - 0.9 - low, abs=0.01)
+    soles = [session.world.data.site(f"{side}_sole").xpos[2] for side in ("left", "right")]
+    assert np.abs(soles).max() < 0.02
+
+
+def test_parallel_arms_share_one_clock_and_one_object_is_a_conflict(session):
+    start(session)
+    pair = act(session, "ResetArm(left) & ResetArm(right)")
+    assert all(outcome.success for outcome in pair)
+    pair = act(session, "Pick(left, Mug_1) & Pick(right, Mug_1)")
+    assert [outcome.code for outcome in pair] == ["ArmConflict", "ArmConflict"]
+
+
+def test_hidden_in_a_closed_fridge(session):
+    inside = FreePlay("kitchen_1", placements=(ObjectPlacement("Apple_1", "Fridge_1"),))
+    start(session, inside)
+    assert act(session, "Pick(left, Apple_1)")[0].code == "ReceptacleClosed"
+
+
+def test_two_hands_lift_a_box():
+    made = Session("h1", image_size=0)
+    start(made, FreePlay("living_room_1", placements=(ObjectPlacement("Box_1", "CoffeeTable_1"),)))
+    assert act(made, "Pick(left, Box_1)")[0].code == "NeedsTwoHands"
+    assert reach(made, "Lift(Box_1)").success
+    assert made.body.lifted == "Box_1" and made.world.metadata()["inventoryObjects"][0]["arms"] == ["left", "right"]
+    assert act(made, "ResetArm(left)")[0].code == "BothHandsBusy"
+    assert reach(made, "PlaceBoth(Desk_1)").success
+    assert "Desk_1" in made.world.parents("Box_1")
+    made.close()
+
+
+def test_bad_luck_is_acted_out():
+    made = Session("h1", "hard", 0)
+    start(made)
+    act(made, "GoTo(Mug_1)")
+    made.draw = lambda action: "broken"  # type: ignore[method-assign]
+    outcome = reach(made, "Pick(right, Mug_1)")
+    assert (outcome.code, outcome.contingency) == ("Broke", "broken")
+    assert made.world.objects["Mug_1"].is_broken and made.body.held[Arm.RIGHT] is None
+    made.close()
+
+
+def test_refuse_and_runaway_skills():
+    action = PlanStep.parse("ResetArm(left)").actions[0]
+    outcome = run_skills([(action, refuse(FailureCode.ARM_CONFLICT))], lambda: None)[0]
+    assert outcome.code == "ArmConflict"
+
+    def endless():
+        while True:
+            yield
+
+    with pytest.raises(RuntimeError, match=r"skills did not end within 120 s: \['ResetArm\(left\)'\]"):
+        run_skills([(action, endless())], lambda: None)
+    assert isinstance(SkillFailure(FailureCode.DROPPED), Exception)
+
+
+def test_a_world_without_robot_is_refused():
+    with pytest.raises(ValueError, match="need a world with a robot"):
+        Body(World(None, "kitchen_1", settle_s=0.0))
