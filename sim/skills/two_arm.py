@@ -30,10 +30,10 @@ Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _APART_M: Final = 0.125
 _TOLERANCE_M: Final = 0.02
-#: Tilt up to which a lifted object counts as level.
-_LEVEL_RAD: Final = 0.2
-#: Ways to hold what was lifted: metres up and towards the body, the best first.
-_HOLDS: Final = ((0.3, 0.12), (0.3, 0.05), (0.25, 0.1), (0.25, 0.0), (0.2, 0.06), (0.2, 0.0), (0.15, 0.05), (0.12, 0.0), (0.08, 0.0))
+#: Ways to hold what was lifted: metres up and towards the body.
+_HOLDS: Final = ((0.3, 0.2), (0.3, 0.12), (0.3, 0.05), (0.25, 0.2), (0.25, 0.1), (0.2, 0.06), (0.15, 0.05), (0.08, 0.0))
+#: Radians of tilt that a metre of height is worth when one of them is chosen.
+_HEIGHT_WEIGHT: Final = 1.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,10 +150,11 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
         yield from body.stow_both()
         code = FailureCode.SPILLED if outcome == "spilled" else FailureCode.SLIPPED
         raise SkillFailure(code, contingency=outcome)
-    goals = [goal for goal in (_shifted(body, up, back) for up, back in _HOLDS) if goal.error_m <= _TOLERANCE_M]
-    if goals:
-        level = next((goal for goal in goals if goal.tilt_rad < _LEVEL_RAD), min(goals, key=lambda goal: goal.tilt_rad))
-        yield from body.move_both([level], speed=0.5)
+    options = [(up, _shifted(body, up, back)) for up, back in _HOLDS]
+    options = [(up, goal) for up, goal in options if goal.error_m <= _TOLERANCE_M]
+    if options:
+        _, hold = min(options, key=lambda option: option[1].tilt_rad - _HEIGHT_WEIGHT * option[0])
+        yield from body.move_both([hold], speed=0.5)
     yield from wait(0.1)
     if body.lifted != thing.object_id or thing.object_id in body.world.all_parents():
         raise SkillFailure(FailureCode.DROPPED)
