@@ -35,6 +35,8 @@ _REHEARSED: Final = 4
 _PATIENCE: Final = 5
 #: Changes of height that are tried at one stance before another stance is.
 _HEIGHT_TRIALS: Final = 2
+#: Height above a surface at which a load is carried towards it.
+_OVER_EDGE_M: Final = 0.04
 #: Looks around for an object that should be near, before giving up.
 _LOOKS: Final = 6
 #: Objects lower than this lie on the floor, out of reach.
@@ -213,6 +215,9 @@ class Expert:
         if wrong is not None and self._count(f"height {target}") < _HEIGHT_TRIALS:
             return self._height_change(wrong.margins["height_m"])
         self._attempts.pop(f"height {target}", None)
+        rise_m = self._rise_m(job)
+        if rise_m > 0.02:
+            return self._height_change(rise_m)
         attempt = self._count(f"stance {target}")
         if attempt >= _PATIENCE:
             return Action("Done")
@@ -228,6 +233,19 @@ class Expert:
         option = fresh[0] if fresh else options[0]
         tried.add(option.to_text())
         return option
+
+    def _rise_m(self, job: Job) -> float:
+        """How much higher a load has to be carried so as not to run into the furniture it is brought to."""
+        world, body = self._session.world, self._session.body
+        load = body.lifted or (None if job.arm is None else body.held[job.arm])
+        thing = world.objects[job.target]
+        if not job.verb.startswith("Place") or load is None or thing.moving:
+            return 0.0
+        spot = world.free_spot(job.target, 0.03)
+        if spot is None:
+            return 0.0
+        missing = float(spot[2]) + _OVER_EDGE_M - float(world.bounds(load)[0][2])
+        return min(missing, body.spec.pelvis_height_range_m[1] - body.pelvis_height_m)
 
     def _height_change(self, height_m: float) -> Action:
         """The change of pelvis height, rounded away from zero to the grid, as far as the legs go."""

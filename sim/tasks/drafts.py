@@ -54,7 +54,8 @@ class Scene:
     Attributes:
         room: name of the layout.
         furniture: ids of the room's own objects.
-        surfaces: furniture on which small objects can be put.
+        surfaces: furniture on which small objects can stand at the start.
+        targets: surfaces with room for hands, onto which tasks move things.
         containers: furniture with a door or drawer that holds small objects.
         switches: furniture that can be turned on and off.
         small: types that one hand picks up, with the furniture of `surfaces` and `containers` that fits them.
@@ -64,6 +65,7 @@ class Scene:
     room: str
     furniture: tuple[str, ...]
     surfaces: tuple[str, ...]
+    targets: tuple[str, ...]
     containers: tuple[str, ...]
     switches: tuple[str, ...]
     small: Mapping[str, tuple[str, ...]]
@@ -229,7 +231,7 @@ def _pick(b: _Builder) -> None:
 
 
 def _place(b: _Builder) -> None:
-    r = b.choose(b.scene.surfaces, "surface")
+    r = b.choose(b.scene.targets, "surface")
     a = b.small(r, avoid=(r,))
     b.ask(_located(a, r), a=a, r=r)
 
@@ -259,7 +261,7 @@ def _toggle_off(b: _Builder) -> None:
 
 
 def _transport_two(b: _Builder) -> None:
-    r = b.choose(b.scene.surfaces, "surface")
+    r = b.choose(b.scene.targets, "surface")
     a = b.small(r, avoid=(r,))
     # Half of the time both stand together, so that both hands can reach at once.
     source = b.draft.objects[a]
@@ -268,8 +270,8 @@ def _transport_two(b: _Builder) -> None:
 
 
 def _transport_each(b: _Builder) -> None:
-    r = b.choose(b.scene.surfaces, "surface")
-    s = b.choose([place for place in b.scene.surfaces if place != r], "second surface")
+    r = b.choose(b.scene.targets, "surface")
+    s = b.choose([place for place in b.scene.targets if place != r], "second surface")
     a = b.small(r, avoid=(r, s))
     c = b.small(s, avoid=(r, s))
     b.ask(_located(a, r), _located(c, s), a=a, b=c, r=r, s=s)
@@ -292,7 +294,7 @@ def _pick_and_open(b: _Builder) -> None:
 
 def _fetch(b: _Builder) -> None:
     s = b.container(is_open=False)
-    r = b.choose(b.scene.surfaces, "surface")
+    r = b.choose(b.scene.targets, "surface")
     a = b.small(r, at=s)
     b.ask(_located(a, r), a=a, r=r, s=s)
 
@@ -341,7 +343,7 @@ def _carry_and_toggle(b: _Builder) -> None:
 def _carry_and_place(b: _Builder) -> None:
     _carry(b)
     r = b.draft.focus["r"]
-    s = b.choose([place for place in b.scene.surfaces if place != r], "second surface")
+    s = b.choose([place for place in b.scene.targets if place != r], "second surface")
     c = b.small(s, avoid=(s,))
     b.ask(_located(c, s), b=c, s=s)
 

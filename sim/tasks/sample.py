@@ -37,11 +37,13 @@ TRAIN_SEEDS: Final = range(100_000, 2**31)
 #: Types that tasks move with one hand. Flat cutlery is left out: fingers of this size do not pick it up from a table.
 _SMALL_TYPES: Final = (
     "Mug", "Cup", "Bowl", "Bottle", "Apple", "Tomato", "SaltShaker", "PepperShaker", "PaperTowelRoll", "SoapBottle", "Book",
-    "RemoteControl", "TissueBox", "Vase", "WateringCan",
+    "RemoteControl", "TissueBox",
 )  # fmt: skip
 #: Types that tasks carry with both hands.
 _BIG_TYPES: Final = ("Box", "HousePlant", "Pot")
 _SURFACE_TYPES: Final = ("CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser", "TVStand", "Shelf")
+#: A television leaves no room for hands on its stand.
+_NO_TARGET_TYPES: Final = ("TVStand",)
 _CONTAINER_TYPES: Final = ("Fridge", "Cabinet", "Drawer", "Microwave")
 _SWITCH_TYPES: Final = ("Faucet", "StoveKnob", "Microwave", "FloorLamp", "Television", "LightSwitch")
 
@@ -86,6 +88,7 @@ def scene_of(room: str) -> Scene:
         return tuple(name for name in ids if kinds[name].name in types)
 
     surfaces, containers = of(_SURFACE_TYPES), of(_CONTAINER_TYPES)
+    targets = tuple(name for name in surfaces if kinds[name].name not in _NO_TARGET_TYPES)
 
     def table(types: Sequence[str], places: Sequence[str]) -> dict[str, tuple[str, ...]]:
         rows: dict[str, tuple[str, ...]] = {}
@@ -100,10 +103,11 @@ def scene_of(room: str) -> Scene:
         room=room,
         furniture=ids,
         surfaces=surfaces,
+        targets=targets,
         containers=containers,
         switches=of(_SWITCH_TYPES),
         small=table(_SMALL_TYPES, (*surfaces, *containers)),
-        big=table(_BIG_TYPES, surfaces),
+        big=table(_BIG_TYPES, targets),
     )
 
 

@@ -9,6 +9,7 @@ SCENE = Scene(
     room="test_room",
     furniture=("CounterTop_1", "DiningTable_1", "SideTable_1", "Fridge_1", "Faucet_1"),
     surfaces=("CounterTop_1", "DiningTable_1", "SideTable_1"),
+    targets=("CounterTop_1", "DiningTable_1", "SideTable_1"),
     containers=("Fridge_1",),
     switches=("Faucet_1",),
     small=dict.fromkeys(
@@ -53,7 +54,7 @@ def test_categories():
 
 
 def test_a_room_without_switches_cannot_offer_toggling():
-    bare = Scene("bare", ("SideTable_1",), ("SideTable_1",), (), (), {"Mug": ("SideTable_1",)}, {})
+    bare = Scene("bare", ("SideTable_1",), ("SideTable_1",), ("SideTable_1",), (), (), {"Mug": ("SideTable_1",)}, {})
     with pytest.raises(NoDraft, match="bare has no switch"):
         draw("toggle_on", bare, np.random.default_rng(0))
     with pytest.raises(NoDraft, match="lift"):
