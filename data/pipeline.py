@@ -32,6 +32,7 @@ from data.motion import FPS
 from data.records import Motion
 from data.retarget import Retargeter
 from data.shards import Manifest, ShardWriter, config_hash
+from data.workers import start_worker
 from sim.robots.spec import load_robot
 
 __all__ = ["PartResult", "Pictures", "Replay", "build_clips", "dataset_folder", "part_of_clips", "prepare_clips"]
@@ -222,7 +223,7 @@ def _computed(
             yield index, part_of_clips(cfg, folder, parts[index], replay)
         return
     context = multiprocessing.get_context("spawn")  # OpenGL and Pinocchio do not survive a fork
-    with ProcessPoolExecutor(min(cfg.workers, len(missing)), mp_context=context) as pool:
+    with ProcessPoolExecutor(min(cfg.workers, len(missing)), mp_context=context, initializer=start_worker) as pool:
         futures = {pool.submit(part_of_clips, cfg, folder, parts[index], replay): index for index in missing}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()

@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 import multiprocessing
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -26,6 +25,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from configs.schema.collect import CollectConfig
 from configs.validate import ConfigError, build
 from data.shards import Manifest, ShardWriter, config_hash
+from data.workers import start_worker
 
 __all__ = ["collect", "main", "parts_of", "rows_of_part"]
 
@@ -91,16 +91,10 @@ def _computed(config: CollectConfig, missing: Sequence[int]) -> Iterator[tuple[i
             yield part, rows_of_part(config, part)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(config.workers, len(missing)), mp_context=context, initializer=_quiet_threads) as pool:
+    with ProcessPoolExecutor(min(config.workers, len(missing)), mp_context=context, initializer=start_worker) as pool:
         futures = {pool.submit(rows_of_part, config, part): part for part in missing}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()
-
-
-def _quiet_threads() -> None:
-    """One thread per worker: the workers are the parallelism."""
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
 
 
 def parse(arguments: Sequence[str]) -> CollectConfig:

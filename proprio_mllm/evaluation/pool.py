@@ -12,13 +12,14 @@ A worker that dies takes its pool with it; the pool is made anew, and an episode
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any, Generic, Protocol, TypeVar
+
+from data.workers import start_worker
 
 __all__ = ["Worker", "run_jobs"]
 
@@ -41,9 +42,9 @@ class Worker(Protocol[J_contra, R_co]):
 _worker: Any = None
 
 
-def _start(make: Callable[[], Any], threads: int) -> None:
+def _start(make: Callable[[], Any]) -> None:
     global _worker
-    os.environ["OMP_NUM_THREADS"] = str(threads)
+    start_worker()
     _worker = make()
 
 
@@ -99,7 +100,7 @@ def _run_pool(
 ) -> Iterator[R]:
     """Works the queue off with one pool; returns early, with a shorter queue, when a process dies."""
     running: dict[Future[R], _Attempt[J]] = {}
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (make, 1))
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (make,))
     try:
         while queue or running:
             while queue and len(running) < workers:

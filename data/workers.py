@@ -1,0 +1,29 @@
+"""How this project's worker processes start: one thread each, and gone when the process that made them is gone.
+
+Workers are spawned, never forked, because neither torch nor an OpenGL context survives a fork. A killed parent cannot tell its
+workers to stop, so each watches for its parent's death. Paper: none (engineering).
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from typing import Final
+
+__all__ = ["start_worker"]
+
+_POLL_S: Final = 1.0
+
+
+def start_worker() -> None:
+    """Initializer of a process pool: limits the numeric libraries to one thread and ends this process with its parent."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
+
+
+def _end_with_parent(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_POLL_S)
+    os._exit(1)
