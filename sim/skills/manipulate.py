@@ -56,11 +56,15 @@ def plan_pick(body: Body, arm: Arm, thing: ObjectInstance) -> tuple[Grasp, Reach
     raise blame(body, {arm: body.world.grips(thing.object_id)[0]}, elsewhere)
 
 
-def _find_grasp(body: Body, arm: Arm, thing: ObjectInstance, limit: int) -> tuple[Grasp, Reach] | None:
-    """The first grasp that the arm can do, of at most `limit` that are within its envelope."""
+def _find_grasp(
+    body: Body, arm: Arm, thing: ObjectInstance, limit: int, avoid: Grasp | None = None
+) -> tuple[Grasp, Reach] | None:
+    """The first grasp that the arm can do and that differs from `avoid`, of at most `limit` that are within its envelope."""
     tried = 0
     for grasp in grasp_candidates(body, arm, thing):
         wish = grasp.hand()
+        if avoid is not None and avoid.family == grasp.family and float(avoid.pointing @ grasp.pointing) > 0.95:
+            continue
         if not body.within(arm, wish.position, body.pelvis_height_m):
             continue
         tried += 1
@@ -134,14 +138,17 @@ def pick(body: Body, action: Action, luck: Luck) -> Skill:
     assert arm is not None and action.object_id is not None
     thing = body.thing(action.object_id)
     name = (thing.object_id,)
-    yield from body.move_hand(arm, grasp.opening, 0.2)
-    yield from body.move_arm(arm, [*reach.way, reach.before])
-    yield from body.move_arm(arm, [reach.at], speed=0.8)
-    yield from wait(0.06)
     geoms = body.solid_geoms(thing)
-    if grasp.opening > 0.9:
-        yield from _close(body, arm, geoms)
+    yield from _grip(body, arm, grasp, reach, geoms)
     gaps = body.probe.finger_gaps_m(arm, geoms)
+    if max(gaps) > GRASP_GAP_M:  # look again and try another way once
+        yield from body.move_hand(arm, 1.0, 0.2)
+        yield from body.move_arm(arm, [reach.before])
+        again = _find_grasp(body, arm, thing, _MAX_PLANS, avoid=grasp)
+        if again is not None:
+            grasp, reach = again
+            yield from _grip(body, arm, grasp, reach, geoms)
+            gaps = body.probe.finger_gaps_m(arm, geoms)
     if max(gaps) > GRASP_GAP_M:
         yield from _retreat(body, arm, reach, name)
         raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": max(gaps)})
@@ -156,6 +163,16 @@ def pick(body: Body, action: Action, luck: Luck) -> Skill:
     yield from stow(body, arm, name)
     if body.held[arm] != thing.object_id:
         raise SkillFailure(FailureCode.DROPPED)
+
+
+def _grip(body: Body, arm: Arm, grasp: Grasp, reach: Reach, geoms: NDArray[np.int64]) -> Skill:
+    """Moves the open hand to the object and closes it."""
+    yield from body.move_hand(arm, grasp.opening, 0.2)
+    yield from body.move_arm(arm, [*reach.way, reach.before])
+    yield from body.move_arm(arm, [reach.at], speed=0.8)
+    yield from wait(0.06)
+    if grasp.opening > 0.9:
+        yield from _close(body, arm, geoms)
 
 
 def _lift(body: Body, arm: Arm) -> Skill:

@@ -141,7 +141,7 @@ def plan_reach(
         before = None
     if before is None:
         return None
-    approach = [before.q + share * (at.q - before.q) for share in (0.0, 0.33, 0.66)]
+    approach = [before.q + share * (at.q - before.q) for share in (0.0, 0.2, 0.4, 0.6, 0.8)]
     if not body.probe.free(arm, approach, ignore, opening):
         return None
     way = route(body, arm, body.commanded_arm(arm), before.q, (), opening)
