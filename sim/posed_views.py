@@ -78,7 +78,7 @@ def type_names() -> tuple[str, ...]:
 def set_pose(world: World, pose: Pose) -> None:
     """Puts the robot into a pose: base, legs that fit the pelvis height, arms and hands; kinematics only."""
     assert world.robot is not None
-    crouches = robot_kit(world.robot.name).crouches
+    crouches = robot_kit(world.robot).crouches
     base = dict(zip(BASE_JOINTS, (pose.x_m, pose.y_m, pose.height_m, pose.yaw_rad, crouches.pitch(pose.height_m)), strict=True))
     legs = dict(zip(world.robot.leg_joints, map(float, crouches.legs(pose.height_m)), strict=True))
     for name, value in (base | legs | dict(pose.joints)).items():
@@ -234,16 +234,13 @@ def views_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
         assert world.robot is not None
         free = navigation_map(world, world.robot.footprint_radius_m).free_positions()
         renderer = Renderer(world, config.image_size, config.image_size)
-        try:
-            before = draw_pose(world, free, rng)
-            for number in range(start, min(start + config.views_per_world, last)):
-                pose = draw_pose(world, free, rng)
-                motion = lead_in(world, _nearby(before, pose, rng), pose, rng)
-                view = renderer.view("head", depth=True, segmentation=True)
-                yield view_row(world, view, motion, number)
-                before = pose
-        finally:
-            renderer.close()
+        before = draw_pose(world, free, rng)
+        for number in range(start, min(start + config.views_per_world, last)):
+            pose = draw_pose(world, free, rng)
+            motion = lead_in(world, _nearby(before, pose, rng), pose, rng)
+            view = renderer.view("head", depth=True, segmentation=True)
+            yield view_row(world, view, motion, number)
+            before = pose
 
 
 def _nearby(before: Pose, pose: Pose, rng: np.random.Generator) -> Pose:

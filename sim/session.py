@@ -174,7 +174,7 @@ class Session:
             start = (task.start.x_m, task.start.y_m, float(np.deg2rad(task.start.yaw_deg)))
             height = task.start.pelvis_height_m.get(self.robot.name)
         if height is not None:
-            legs = robot_kit(self.robot.name).crouches.legs(height)
+            legs = robot_kit(self.robot).crouches.legs(height)
             joints |= dict(zip(self.robot.leg_joints, map(float, legs), strict=True))
         self.world = World(
             self.robot,

@@ -155,7 +155,7 @@ class World:
         x, y, yaw_deg = self.room.start
         x, y, yaw = start if start is not None else (x, y, float(np.radians(yaw_deg)))
         height = robot.standing_pelvis_height_m if pelvis_height_m is None else pelvis_height_m
-        crouches = robot_kit(robot.name).crouches
+        crouches = robot_kit(robot).crouches
         height = crouches.clamp(height)
         targets: dict[str, float] = dict(zip(BASE_JOINTS, (x, y, height, yaw, crouches.pitch(height)), strict=True))
         targets |= dict(zip(robot.leg_joints, map(float, crouches.legs(height)), strict=True))
@@ -327,7 +327,7 @@ class World:
     def command_height(self, pelvis_height_m: float) -> None:
         """Commands a pelvis height with the legs and the trunk's lean that belong to it, clipped to the robot's range."""
         robot = self._robot()
-        crouches = robot_kit(robot.name).crouches
+        crouches = robot_kit(robot).crouches
         height = crouches.clamp(pelvis_height_m)
         self.data.ctrl[self._actuator["base_z"]] = height
         self.data.ctrl[self._actuator["base_pitch"]] = crouches.pitch(height)

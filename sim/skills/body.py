@@ -97,7 +97,7 @@ class Body:
         if world.robot is None:
             raise ValueError("skills need a world with a robot, got one without")
         self.spec = world.robot
-        kit = robot_kit(self.spec.name)
+        kit = robot_kit(self.spec)
         self.kinematics = kit.model
         self.crouches = kit.crouches
         self.whole_body = kit.solver
