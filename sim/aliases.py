@@ -1,8 +1,8 @@
 """Other simulators' action names: AI2-THOR's and DualTHOR's, mapped onto the action grammar of `data.records`.
 
-Units follow the names' origin. DualTHOR: `moveahead` with magnitude 1 is 1 m, `moveup` 0.1 m, `rotateright` 90 degrees. AI2-THOR:
-`moveMagnitude` in metres, `degrees` for rotations. Episode control (undo, save, teleport ...) is not part of the grammar and is
-handled by `sim.controller`.
+Units follow the names' origin. DualTHOR: `moveahead` with magnitude 1 is 1 m, `moveup` 0.1 m, `rotateright` 90 degrees.
+AI2-THOR: `moveMagnitude` in metres, `degrees` for rotations. Episode control (undo, save, teleport ...) is not part of the
+grammar and is handled by `sim.controller`.
 """
 
 from __future__ import annotations

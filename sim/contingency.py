@@ -4,9 +4,9 @@ A draw is a pure function of (seed, step, action, object): every planner that do
 trial meets the same luck, and no generator has to be carried around or saved. Outcomes are drawn after an action has proved
 geometrically and logically possible; the skill then acts them out in the physics.
 
-Paper: stochastic contingencies (the cup with 80/10/10 success, spilled, broken) and the difficulties easy, medium, hard with 100,
-50 and 20 % success of low-level skills. Body movements are not subject to contingencies here: the paper's table of rates gives
-them 98 % and more.
+Paper: stochastic contingencies (the cup with 80/10/10 success, spilled, broken) and the difficulties easy, medium, hard with
+100, 50 and 20 % success of low-level skills. Body movements are not subject to contingencies here: the paper's table of rates
+gives them 98 % and more.
 """
 
 from __future__ import annotations
@@ -135,7 +135,8 @@ class Contingency:
         u = _uniform(self.seed, step, action, object_id)
         cumulative = 0.0
         outcome = "success"
-        for outcome, p in self.distribution(action, object_type, state).items():
+        for name, p in self.distribution(action, object_type, state).items():
+            outcome = name  # the last one, should rounding leave u above the sum
             cumulative += p
             if u < cumulative:
                 break

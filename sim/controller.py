@@ -1,11 +1,12 @@
 """AI2-THOR-style front end: `event = controller.step(action="Pick", objectId="Mug_1", arm="left")`.
 
 The same session, physics and failure codes as everywhere else, behind the interface that users of AI2-THOR and DualTHOR know.
-Action names of both are understood (`sim.aliases`), DualTHOR's `{"actions": [a, b], "executionMode": "parallel"}` included. A failed
-action returns an event with `lastActionSuccess` False and an `errorCode`; an unknown action or argument raises ValueError.
+Action names of both are understood (`sim.aliases`), DualTHOR's `{"actions": [a, b], "executionMode": "parallel"}` included. A
+failed action returns an event with `lastActionSuccess` False and an `errorCode`; an unknown action or argument raises
+ValueError.
 
-Episode control that is not part of the planner's grammar lives here: Undo, Redo, SaveState, LoadState, Reset, GetReachablePositions
-and the privileged TP (teleport), which needs `privileged=True`.
+Episode control that is not part of the planner's grammar lives here: Undo, Redo, SaveState, LoadState, Reset,
+GetReachablePositions and the privileged TP (teleport), which needs `privileged=True`.
 """
 
 from __future__ import annotations

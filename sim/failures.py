@@ -6,8 +6,8 @@ a body movement is navigation, a change of body height is body adjustment, every
 the planner is to notice and recover.
 
 Margins are signed: `reach_m` is how far the target lies beyond the arm (positive: too far), `height_m` the change of pelvis
-height that would bring it into reach (negative: move down), `mass_kg` the mass above the limit, `travel_m` the distance that was
-covered before a path was blocked, `gap_m` the distance between the fingers and what they should have touched.
+height that would bring it into reach (negative: move down), `mass_kg` the mass above the limit, `travel_m` the distance that
+was covered before a path was blocked, `gap_m` the distance between the fingers and what they should have touched.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ FAILURES: Final[Mapping[FailureCode, FailureSpec]] = {
 }
 
 
-class SkillFailure(Exception):
+class SkillFailure(Exception):  # noqa: N818  # a failed skill is an outcome, not an error
     """Raised inside a skill to end it with a failure code; the skill runner turns it into an `ActionOutcome`.
 
     Attributes:

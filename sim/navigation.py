@@ -95,9 +95,9 @@ class NavigationMap:
             raise ValueError(f"bounds must be (x_min, y_min, x_max, y_max) with max > min, got {self.bounds}")
         if self.radius_m <= 0.0:
             raise ValueError(f"radius_m must be positive, got {self.radius_m}")
-        self._boxes = np.array(
-            [(*r.center, *r.half, np.cos(r.yaw_rad), np.sin(r.yaw_rad)) for r in self.obstacles]
-        ).reshape(-1, 6)
+        self._boxes = np.array([(*r.center, *r.half, np.cos(r.yaw_rad), np.sin(r.yaw_rad)) for r in self.obstacles]).reshape(
+            -1, 6
+        )
         columns = int(np.floor((x1 - x0) / _RESOLUTION_M)) + 1
         rows = int(np.floor((y1 - y0) / _RESOLUTION_M)) + 1
         self._shape = (rows, columns)

@@ -1,8 +1,8 @@
 """One robot in one room with one task: reset, step, observe, judge, save and restore.
 
-A session is what planners are run against and what the Gymnasium environment and the AI2-THOR-style controller wrap. It owns the
-world, the trial's luck, what the robot has seen so far, the history and the running statistics. Everything that a later step
-depends on is part of `snapshot()`, so restoring and repeating gives bit-equal results.
+A session is what planners are run against and what the Gymnasium environment and the AI2-THOR-style controller wrap. It owns
+the world, the trial's luck, what the robot has seen so far, the history and the running statistics. Everything that a later
+step depends on is part of `snapshot()`, so restoring and repeating gives bit-equal results.
 
 Paper: problem formulation (observation, dual-arm action, feedback), undo and redo of DualTHOR.
 """
@@ -45,34 +45,34 @@ class StartLike(Protocol):
     """Start pose of the robot; `sim.tasks.task.Start` has this shape."""
 
     @property
-    def x_m(self) -> float: ...  # noqa: D102
+    def x_m(self) -> float: ...
     @property
-    def y_m(self) -> float: ...  # noqa: D102
+    def y_m(self) -> float: ...
     @property
-    def yaw_deg(self) -> float: ...  # noqa: D102
+    def yaw_deg(self) -> float: ...
     @property
-    def pelvis_height_m(self) -> Mapping[str, float]: ...  # noqa: D102
+    def pelvis_height_m(self) -> Mapping[str, float]: ...
 
 
 class TaskLike(Protocol):
     """What a session needs of a task; `sim.tasks.task.Task` has this shape."""
 
     @property
-    def room(self) -> str: ...  # noqa: D102
+    def room(self) -> str: ...
     @property
-    def instruction(self) -> str: ...  # noqa: D102
+    def instruction(self) -> str: ...
     @property
-    def start(self) -> StartLike | None: ...  # noqa: D102
+    def start(self) -> StartLike | None: ...
     @property
-    def placements(self) -> Sequence[Placement] | None: ...  # noqa: D102
+    def placements(self) -> Sequence[Placement] | None: ...
     @property
-    def states(self) -> Mapping[str, Mapping[str, bool | float | str]]: ...  # noqa: D102
+    def states(self) -> Mapping[str, Mapping[str, bool | float | str]]: ...
     @property
-    def goals(self) -> Sequence[GoalLike]: ...  # noqa: D102
+    def goals(self) -> Sequence[GoalLike]: ...
     @property
-    def step_budget(self) -> int: ...  # noqa: D102
+    def step_budget(self) -> int: ...
     @property
-    def seed(self) -> int: ...  # noqa: D102
+    def seed(self) -> int: ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
 """Open, Close, ToggleOn, ToggleOff: hands on handles and switches.
 
 The hand goes to the handle until it touches it, then leads it along the door's arc or the drawer's slide; a ball joint at the
-grasp stands for the fingers around the bar. Where the arm cannot follow all the way, the robot steps back with it. What counts is
-the joint's position afterwards. A switch flips when a finger touches it.
+grasp stands for the fingers around the bar. Where the arm cannot follow all the way, the robot steps back with it. What counts
+is the joint's position afterwards. A switch flips when a finger touches it.
 
 Paper: Open and Toggle of the DualTHOR action space; Close is ours.
 """
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from data.records import Action, Arm
 from sim.failures import FailureCode, SkillFailure
 from sim.navigation import Stance
-from sim.objects import MovingPart, ObjectInstance
+from sim.objects import MovingPart
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
 from sim.skills.grasps import hand_shape
@@ -61,7 +61,7 @@ class Pull:
 
 
 def carried_point(body: Body, part: MovingPart, now: Array, position: float) -> Array:
-    """(3,) world position, at another joint position, of a point that is fixed to a door or drawer and is at `now` at present."""
+    """(3,) world position, at another joint position, of a point fixed to a door or drawer that is at `now` at present."""
     model, data = body.world.model, body.world.data
     axis, change = data.xaxis[part.joint_id], position - float(data.qpos[part.qpos_adr])
     if int(model.jnt_type[part.joint_id]) == 2:  # slide
@@ -118,9 +118,7 @@ def assess_open_close(body: Body, action: Action) -> Pull:
         raise blame(body, {arm: handle}, search) from None
 
 
-def _plan_pull(
-    body: Body, arm: Arm, part: MovingPart, reach: Reach, hand: Array, goal: float, opening: bool
-) -> Pull | None:
+def _plan_pull(body: Body, arm: Arm, part: MovingPart, reach: Reach, hand: Array, goal: float, opening: bool) -> Pull | None:
     start = float(body.world.data.qpos[part.qpos_adr])
     positions = np.linspace(start, goal, _WAYPOINTS)
     base = body.commanded_base()

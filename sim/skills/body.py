@@ -1,9 +1,9 @@
 """The robot as skills see it: commanded posture, inverse kinematics in the world, hands, and what they hold.
 
 Skills own disjoint sets of joints: an arm skill its arm and hand, a body skill base and legs, a two-arm skill both arms and the
-waist. `Body` has no state of its own: what is commanded is in the simulator's controls and what is held in the objects, so that a
-world snapshot is a snapshot of everything. The waist stays straight while a single arm acts, so that parallel arm skills do not
-disturb each other.
+waist. `Body` has no state of its own: what is commanded is in the simulator's controls and what is held in the objects, so that
+a world snapshot is a snapshot of everything. The waist stays straight while a single arm acts, so that parallel arm skills do
+not disturb each other.
 
 Paper: low-level control through inverse kinematics (each arm alone, or the whole body).
 Frames: `world`; `pelvis` is the pelvis heading frame.
@@ -109,7 +109,9 @@ class Body:
         self._joint_adr = np.array([int(model.joint(name).qposadr[0]) for name in self.spec.joints])
         self._site = {arm: int(model.site(self.spec.arms[arm.value].grasp_site).id) for arm in Arm}
         self._arm_ids = {arm: np.array([self._actuators[name] for name in self.spec.arms[arm.value].joints]) for arm in Arm}
-        self._hand_ids = {arm: np.array([self._actuators[name] for name in self.spec.arms[arm.value].hand_joints]) for arm in Arm}
+        self._hand_ids = {
+            arm: np.array([self._actuators[name] for name in self.spec.arms[arm.value].hand_joints]) for arm in Arm
+        }
         self._waist_ids = np.array([self._actuators[name] for name in self.spec.waist_joints])
         self._columns = {arm: kit.model.indices(self.spec.arms[arm.value].joints) for arm in Arm}
         self.considered_height_m: float | None = None
@@ -193,7 +195,9 @@ class Body:
 
     def part_geoms(self, thing: ObjectInstance, option: str) -> NDArray[np.int64]:
         """Geoms of an object's parts with a catalogue option, such as `handle` or `toggle`."""
-        return np.array([geom for geom, part in self.world.part_of_geom[thing.object_id] if option in part.options], dtype=np.int64)
+        return np.array(
+            [geom for geom, part in self.world.part_of_geom[thing.object_id] if option in part.options], dtype=np.int64
+        )
 
     def interaction_point(self, object_id: str) -> Array:
         """(3,) world point that a robot who goes to an object wants before it: handle, inside, switch or centre."""
@@ -241,7 +245,16 @@ class Body:
         narrow = 0.5 * float(np.min(thing.local_max[:2] - thing.local_min[:2]))
         radius = thing.footprint_radius_m if arm is not None else narrow
         for gap in (0.04, 0.01):
-            for dx, dy in ((0.0, 0.0), (0.0, 0.12), (0.0, -0.12), (0.1, 0.0), (-0.1, 0.0), (0.0, 0.25), (0.0, -0.25), (0.15, 0.0)):
+            for dx, dy in (
+                (0.0, 0.0),
+                (0.0, 0.12),
+                (0.0, -0.12),
+                (0.1, 0.0),
+                (-0.1, 0.0),
+                (0.0, 0.25),
+                (0.0, -0.25),
+                (0.15, 0.0),
+            ):
                 near = easy[:2] + self.turn_to_world(np.array([dx, dy, 0.0]))[:2]
                 spot = self.world.free_spot(
                     receptacle.object_id, radius, height_m=thing.height_m, near=near, gap_m=gap,
@@ -266,7 +279,7 @@ class Body:
     @property
     def held(self) -> dict[Arm, str | None]:
         """What each hand holds."""
-        found: dict[Arm, str | None] = {arm: None for arm in Arm}
+        found: dict[Arm, str | None] = dict.fromkeys(Arm)
         for name, thing in self.world.objects.items():
             for arm in thing.held_by:
                 found[Arm(arm)] = name
@@ -352,7 +365,7 @@ class Body:
         return self.world.data.ctrl[self._arm_ids[arm]].copy()
 
     def ready(self, arm: Arm) -> Array:
-        """(A,) posture between actions: hand before the shoulder, fingers level ahead, above tables and beside the camera's view."""
+        """(A,) posture between actions: hand before the shoulder, fingers level, above tables and beside the camera's view."""
         return ready_posture(self.spec.name, arm)
 
     def carrying(self, arm: Arm) -> Array:
@@ -360,7 +373,11 @@ class Body:
 
         A load before a hand that is lower than a worktop would run into its front when the robot steps up to it.
         """
-        ready_m = self.spec.standing_pelvis_height_m + float(self.maps[arm.value].shoulder[2]) - _READY_DROP * self.maps[arm.value].reach_m
+        ready_m = (
+            self.spec.standing_pelvis_height_m
+            + float(self.maps[arm.value].shoulder[2])
+            - _READY_DROP * self.maps[arm.value].reach_m
+        )
         return ready_posture(self.spec.name, arm, raised=ready_m < _WORKTOP_M)
 
     def solve(
@@ -415,7 +432,9 @@ class Body:
                 pointing_weight if local.pointing is not None else 0.0,
                 roll_weight if local.closing is not None else 0.0,
             )
-            result = self._per_arm.solve({arm.value: target}, q, pelvis_height_m=height, restarts=0, tolerance_m=REACH_TOLERANCE_M)
+            result = self._per_arm.solve(
+                {arm.value: target}, q, pelvis_height_m=height, restarts=0, tolerance_m=REACH_TOLERANCE_M
+            )
             reached = self.kinematics.frames(root, result.q, site)[0, :3, :3]
             pointing = 1.0 if local.pointing is None else float(reached[:, 0] @ local.pointing)
             along = 1.0 if local.closing is None else float(reached[:, 1] @ local.closing)
@@ -455,7 +474,9 @@ class Body:
             rotation = local.rotation(local.pointing, local.closing)
             targets[arm.value] = ReachTarget(local.position, rotation, 0.15, 0.08)
             upright = HandPose(lean.T @ local.position, lean.T @ local.pointing, lean.T @ local.closing)
-            q[self._columns[arm]] = self.maps[arm.value].starts(upright, 1, near=self.ready(arm))[0] if start is None else start[arm]
+            q[self._columns[arm]] = (
+                self.maps[arm.value].starts(upright, 1, near=self.ready(arm))[0] if start is None else start[arm]
+            )
         result = self.whole_body.solve(targets, q, pelvis_height_m=height, restarts=1, tolerance_m=REACH_TOLERANCE_M)
         waist = self.kinematics.indices(self.spec.waist_joints)
         arms = {arm: result.q[self._columns[arm]].copy() for arm in Arm}

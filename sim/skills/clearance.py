@@ -58,10 +58,16 @@ class ClearanceProbe:
         self._scratch = mujoco.MjData(world.model)
         model = world.model
         self._geoms = {arm: _limb_geoms(model, body.spec.arms[arm.value].joints[-2]) for arm in Arm}
-        self._arm_adr = {arm: np.array([int(model.joint(n).qposadr[0]) for n in body.spec.arms[arm.value].joints]) for arm in Arm}
+        self._arm_adr = {
+            arm: np.array([int(model.joint(n).qposadr[0]) for n in body.spec.arms[arm.value].joints]) for arm in Arm
+        }
         self._height_adr = [int(model.joint(name).qposadr[0]) for name in ("base_z", "base_pitch")]
         self._couplings = [
-            (int(model.jnt_qposadr[model.eq_obj1id[e]]), int(model.jnt_qposadr[model.eq_obj2id[e]]), model.eq_data[e, 4::-1].copy())
+            (
+                int(model.jnt_qposadr[model.eq_obj1id[e]]),
+                int(model.jnt_qposadr[model.eq_obj2id[e]]),
+                model.eq_data[e, 4::-1].copy(),
+            )
             for e in range(model.neq)
             if int(model.eq_type[e]) == int(mujoco.mjtEq.mjEQ_JOINT) and model.eq_obj2id[e] >= 0
         ]
@@ -138,9 +144,7 @@ class ClearanceProbe:
         turn = rotation.T @ world.data.xmat[thing.body_id].reshape(3, 3)
         return _Cargo(site, thing.qpos_adr, offset, turn, frozenset(map(int, thing.geom_ids)))
 
-    def free(
-        self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str | int] = (), opening: float | None = None
-    ) -> bool:
+    def free(self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str | int] = (), opening: float | None = None) -> bool:
         """Whether some arm postures at most touch what is around."""
         return bool(np.all(self.depths_m(arm, postures, ignore, opening) <= TOUCH_M))
 
@@ -175,5 +179,7 @@ def _limb_geoms(model: mujoco.MjModel, joint: str) -> frozenset[int]:
     for index in range(top + 1, model.nbody):
         if int(model.body_parentid[index]) in below:
             below.add(index)
-    geoms = np.flatnonzero(np.isin(model.geom_bodyid, sorted(below)) & ((model.geom_contype > 0) | (model.geom_conaffinity > 0)))
+    geoms = np.flatnonzero(
+        np.isin(model.geom_bodyid, sorted(below)) & ((model.geom_contype > 0) | (model.geom_conaffinity > 0))
+    )
     return frozenset(int(index) for index in geoms)

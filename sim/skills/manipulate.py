@@ -1,8 +1,8 @@
 """One-arm skills on movable objects: Pick, Place, ResetArm.
 
-A grasp holds only when both opposing finger groups touch the object, or are within 15 mm of it, after the hand has closed around
-it in physics; only then is the object tied to the hand. Place lowers the object until it touches, opens, and looks whether it
-has come to rest where it should. Every failure brings the arm back to a safe posture first.
+A grasp holds only when both opposing finger groups touch the object, or are within 15 mm of it, after the hand has closed
+around it in physics; only then is the object tied to the hand. Place lowers the object until it touches, opens, and looks
+whether it has come to rest where it should. Every failure brings the arm back to a safe posture first.
 
 Paper: Pick and Place of the DualTHOR action space, there without contact.
 """
@@ -261,9 +261,7 @@ def place(body: Body, action: Action, luck: Luck) -> Skill:
         if outcome == "spilled" and thing.type.fillable:
             body.world.set_state(thing.object_id, "isFilledWithLiquid", False)
         yield from stow(body, arm, name)
-        raise SkillFailure(
-            FailureCode.SPILLED if outcome == "spilled" else FailureCode.NOTHING_HAPPENED, contingency=outcome
-        )
+        raise SkillFailure(FailureCode.SPILLED if outcome == "spilled" else FailureCode.NOTHING_HAPPENED, contingency=outcome)
     lowering = body.move_arm(arm, [reach.at], speed=0.6)
     for _ in lowering:
         yield
@@ -345,6 +343,5 @@ def _upright(rotation: Array) -> Array:
 
 def _lowest(thing: ObjectInstance, rotation: Array) -> float:
     """Height of the lowest corner of the object's box relative to its frame, for an orientation."""
-    corners = np.array([[x, y, z] for x in (thing.local_min[0], thing.local_max[0])
-                        for y in (thing.local_min[1], thing.local_max[1]) for z in (thing.local_min[2], thing.local_max[2])])  # fmt: skip
+    corners = np.stack(np.meshgrid(*zip(thing.local_min, thing.local_max, strict=True)), axis=-1).reshape(-1, 3)  # (8, 3)
     return float((corners @ rotation[2]).min())

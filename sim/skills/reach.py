@@ -1,7 +1,7 @@
 """From a wish for the hand to a checked arm motion, or to the failure code that says what is wrong.
 
-A wish that the arm cannot fulfil is told apart by trying other pelvis heights at the same stance: none helps, TooFar; a lower one
-does, BodyTooHigh; a higher one does, BodyTooLow; the present one should do but every motion collides, Obstructed.
+A wish that the arm cannot fulfil is told apart by trying other pelvis heights at the same stance: none helps, TooFar; a lower
+one does, BodyTooHigh; a higher one does, BodyTooLow; the present one should do but every motion collides, Obstructed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from data.records import Arm
 from sim.failures import FailureCode, SkillFailure
 from sim.skills.body import REACH_TOLERANCE_M, ArmGoal, Body
-from sim.skills.clearance import TOUCH_M
 from sim.skills.reach_map import HandPose
 
 __all__ = ["Reach", "blame", "plan_reach", "route"]
@@ -64,7 +63,10 @@ def blame(body: Body, points: Mapping[Arm, Array], plan: Callable[[], object]) -
         return SkillFailure(FailureCode.OBSTRUCTED)
     present = body.pelvis_height_m
     common = [height for height in body.heights() if all(body.within(arm, p, height) for arm, p in points.items())]
-    gap = max(max(body.maps[a.value].beyond_m(body.in_trunk(p)), body.maps[a.value].gap_m(body.in_trunk(p))) for a, p in points.items())
+    gap = max(
+        max(body.maps[a.value].beyond_m(body.in_trunk(p)), body.maps[a.value].gap_m(body.in_trunk(p)))
+        for a, p in points.items()
+    )
     for height in sorted(common, key=lambda height: abs(height - present)):
         if abs(height - present) < 0.03:
             continue
@@ -123,7 +125,8 @@ def plan_reach(
         retreat: unit direction from the target back to where the straight line starts.
         distance_m: length of the straight line.
         ignore: ids of objects, or numbers of geoms, that may be touched at the target.
-        pointing, closing: cosines that are demanded.
+        pointing: cosine demanded of the fingers' direction.
+        closing: cosine demanded of the closing direction.
         opening: opening of the hand on the way, None as it is.
         start: (A,) joints near the solution, when they are known.
     """

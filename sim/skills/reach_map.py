@@ -1,8 +1,9 @@
 """What each arm reaches: a table of sampled arm postures with the pose of the hand, and quick questions to it.
 
-Inverse kinematics with few degrees of freedom (H1: five per arm) has local minima and no room for an arbitrary hand orientation.
-The table answers both: for a point it gives the posture whose hand points best, as the start of the solver, and it tells at which
-other pelvis heights the point would be in reach. Sampling is uniform over the joint ranges, with a fixed seed, once per robot.
+Inverse kinematics with few degrees of freedom (H1: five per arm) has local minima and no room for an arbitrary hand
+orientation. The table answers both: for a point it gives the posture whose hand points best, as the start of the solver, and it
+tells at which other pelvis heights the point would be in reach. Sampling is uniform over the joint ranges, with a fixed seed,
+once per robot.
 
 Frames: `pelvis` is the pelvis heading frame. Shape letters: S samples, A arm joints.
 """
@@ -16,7 +17,7 @@ from typing import Final
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sim.robots.kinematics import RobotModel
 from sim.robots.spec import load_robot
@@ -85,7 +86,7 @@ class ReachMap:
     y_axes: Array
     shoulder: Array
     reach_m: float
-    tree: cKDTree
+    tree: KDTree
 
     def contains(self, point: Array) -> bool:
         """Whether the arm can bring its grasp site to (about) a point."""
@@ -137,7 +138,9 @@ def reach_maps(robot_name: str) -> dict[str, ReachMap]:
         for side, arm in spec.arms.items()
     }
     frames = {side: robot.frame_id(arm.grasp_site) for side, arm in spec.arms.items()}
-    draws = {side: rng.uniform(robot.lower[index], robot.upper[index], (_SAMPLES, len(index))) for side, index in columns.items()}
+    draws = {
+        side: rng.uniform(robot.lower[index], robot.upper[index], (_SAMPLES, len(index))) for side, index in columns.items()
+    }
     hands = {side: np.empty((_SAMPLES, 3, 3)) for side in spec.arms}  # rows: position, x axis, y axis
     full = base.copy()
     for i in range(_SAMPLES):
@@ -157,5 +160,5 @@ def reach_maps(robot_name: str) -> dict[str, ReachMap]:
         reach = float(np.linalg.norm(positions[sensible] - shoulder, axis=1).max())
         kept = positions[sensible]
         x_axes, y_axes = hands[side][sensible, 1], hands[side][sensible, 2]
-        maps[side] = ReachMap(draws[side][sensible], kept, x_axes, y_axes, shoulder, reach, cKDTree(kept))
+        maps[side] = ReachMap(draws[side][sensible], kept, x_axes, y_axes, shoulder, reach, KDTree(kept))
     return maps
