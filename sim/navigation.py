@@ -104,7 +104,7 @@ class NavigationMap:
         xs = x0 + np.arange(columns) * _RESOLUTION_M
         ys = y0 + np.arange(rows) * _RESOLUTION_M
         grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)  # (R*C, 2), x fastest
-        self._clearance = self.clearance(grid)  # (R*C,)
+        self._clearance = self.clearance(np.asarray(grid, dtype=np.float64))  # (R*C,)
         self._free = self._clearance >= 0.0
         self._free_cells = np.flatnonzero(self._free)
         self._free_points = self.points(self._free_cells)
