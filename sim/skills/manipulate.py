@@ -275,7 +275,7 @@ def place(body: Body, action: Action, luck: Luck) -> Skill:
     position, hand = body.hand_pose(arm)
     back = body.solve(arm, HandPose(position + 0.09 * retreat, hand[:, 0], hand[:, 1]), start=body.commanded_arm(arm))
     yield from body.move_arm(arm, [back.q if back.error_m < 0.03 else reach.before])
-    yield from stow(body, arm, name)
+    yield from stow(body, arm)
     for _ in range(int(1.0 / CONTROL_DT_S)):
         if body.world.speed_of(thing.object_id) < 0.02:
             break
