@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from sim.objects import ObjectInstance, Surface
 
-__all__ = ["REACH_BAND_M", "box_in_world", "find_free_spot", "resting_on"]
+__all__ = ["OVERHANG_SHARE", "REACH_BAND_M", "box_in_world", "find_free_spot", "resting_on"]
 
 #: Depth from a receptacle's reachable edge within which objects are put.
 REACH_BAND_M: Final = 0.35
+#: Share of an object's narrow half that has to be on the surface: a wide load may stand over the edge by the rest.
+OVERHANG_SHARE: Final = 0.6
 _GRID_M: Final = 0.02
 _SMALL_M: Final = 0.15
 

@@ -23,7 +23,7 @@ from sim.catalogue import Part, load_catalogue
 from sim.constraints import GraspConstraints
 from sim.metadata import world_metadata
 from sim.objects import STATE_NAMES, ObjectInstance, ObjectPlacement, ObjectState, Placement, copy_state, index_object
-from sim.placement import REACH_BAND_M, box_in_world, find_free_spot, resting_on
+from sim.placement import OVERHANG_SHARE, REACH_BAND_M, box_in_world, find_free_spot, resting_on
 from sim.recorder import FRAME_DT_S, MotionWindow, Recorder
 from sim.rendering import Renderer, View
 from sim.robots.build_solver import robot_kit
@@ -192,8 +192,8 @@ class World:
         carrier.openness = 1.0  # a start in a closed cabinet is allowed; only hands need the door open
         target = None if placement.xy is None else np.asarray(placement.xy, dtype=float)
         spot: NDArray[np.float64] | None = None
-        # An explicit place only has to carry the object: its narrow side may be flush with the edge.
-        narrow = float(np.min(thing.local_max[:2] - thing.local_min[:2])) / 2.0
+        # An explicit place only has to carry the object: it may stand a little over the edge.
+        narrow = OVERHANG_SHARE * float(np.min(thing.local_max[:2] - thing.local_min[:2])) / 2.0
         for gap in (0.0,) if target is not None else (_HAND_GAP_M, 0.04, 0.01):
             spot = find_free_spot(
                 self.data,

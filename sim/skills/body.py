@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from data.records import Action, Arm
 from sim.navigation import NavigationMap, Stance
 from sim.objects import ObjectInstance
+from sim.placement import OVERHANG_SHARE
 from sim.robots.arm_ik import PerArmSolver
 from sim.robots.build_solver import robot_kit
 from sim.robots.solver import ReachTarget
@@ -241,8 +242,8 @@ class Body:
         """Free spots (3,) on a receptacle for an object, the ones the arm reaches most easily first."""
         easy = self.easy_point(arm)
         spots: list[Array] = []
-        # What two hands carry is held with its long side across: its narrow side may be flush with the edge.
-        narrow = 0.5 * float(np.min(thing.local_max[:2] - thing.local_min[:2]))
+        # What two hands carry is held with its long side across: its narrow side may stand a little over the edge.
+        narrow = 0.5 * OVERHANG_SHARE * float(np.min(thing.local_max[:2] - thing.local_min[:2]))
         radius = thing.footprint_radius_m if arm is not None else narrow
         for gap in (0.04, 0.01):
             for dx, dy in (

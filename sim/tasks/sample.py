@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sim.catalogue import ObjectType, load_catalogue
 from sim.navigation import NavigationMap
+from sim.placement import OVERHANG_SHARE
 from sim.robots.build_solver import robot_kit
 from sim.robots.spec import load_robot
 from sim.rooms import load_room
@@ -41,6 +42,8 @@ _SMALL_TYPES: Final = (
 )  # fmt: skip
 #: Types that tasks carry with both hands.
 _BIG_TYPES: Final = ("Box", "HousePlant", "Pot")
+#: What a robot's two arms do not get around, whatever the furniture.
+_TOO_WIDE: Final[Mapping[str, tuple[str, ...]]] = {"x1": ("Pot",)}
 _SURFACE_TYPES: Final = ("CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser", "TVStand", "Shelf")
 #: A television leaves no room for hands on its stand.
 _NO_TARGET_TYPES: Final = ("TVStand",)
@@ -160,6 +163,10 @@ def settle(draft: Draft, task_id: str, seed: int, split: str, rng: np.random.Gen
         WorldError: when the objects do not fit, or one of the robots cannot reach what it has to touch from anywhere.
     """
     scene = scene_of(draft.room)
+    for name in robots:
+        wide = [item for item in draft.objects if item.rsplit("_", 1)[0] in _TOO_WIDE.get(name, ())]
+        if wide:
+            raise WorldError(f"{name} does not get around {wide[0]}")
     empty = _empty_world(draft.room)
     spots = _spots(empty, draft, rng)
     placements = tuple(
@@ -216,7 +223,9 @@ def _spots(empty: World, draft: Draft, rng: np.random.Generator) -> dict[str, ND
     for name, carrier in draft.objects.items():
         kind = catalogue.get(name.rsplit("_", 1)[0])
         radius, narrow = float(np.hypot(kind.size[0], kind.size[1])) / 2.0, min(kind.size[0], kind.size[1]) / 2.0
-        band = max(_EDGE_BAND_M, narrow + 0.05)
+        if kind.name in _BIG_TYPES:
+            narrow *= OVERHANG_SHARE
+        band = narrow + 0.06 if kind.name in _BIG_TYPES else max(_EDGE_BAND_M, narrow + 0.05)
         thing = empty.object(carrier)
         was_open, thing.openness = thing.openness, 1.0
         for _ in range(12):
