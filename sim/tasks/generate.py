@@ -62,10 +62,10 @@ SLOTS: Final = (
     Slot("toggle_on", "living_room_1", 1),
     Slot("toggle_off", "kitchen_1", 1),
     Slot("transport_two", "kitchen_1", 2),
-    Slot("transport_two", "living_room_1", 1),
+    Slot("pick_and_toggle_off", "kitchen_1", 1),
     Slot("transport_each", "kitchen_1", 1),
     Slot("pick_and_toggle_on", "kitchen_1", 1),
-    Slot("pick_and_toggle_off", "living_room_1", 1),
+    Slot("fetch_hold", "kitchen_1", 1),
     Slot("pick_and_open", "kitchen_1", 1),
     Slot("pick_and_open", "living_room_1", 1),
     Slot("fetch", "kitchen_1", 1),
@@ -154,7 +154,7 @@ def _solved(task: Task) -> tuple[Task, tuple[Certificate, ...]] | None:
 
 
 def _fill(number: int, slot: Slot) -> list[tuple[Task, tuple[Certificate, ...]]]:
-    """The slot's tasks, with different goals."""
+    """The slot's tasks, with different instructions."""
     found: list[tuple[Task, tuple[Certificate, ...]]] = []
     for seed in range(number * _SEEDS_PER_SLOT, number * _SEEDS_PER_SLOT + _TRIES * slot.count):
         if len(found) == slot.count:
@@ -163,7 +163,7 @@ def _fill(number: int, slot: Slot) -> list[tuple[Task, tuple[Certificate, ...]]]
             task = sample_task(seed, slot.room, slot.family, "benchmark")
         except ValueError:
             continue
-        if any(task.goals == other.goals for other, _ in found):
+        if any(task.instruction == other.instruction for other, _ in found):
             continue
         solved = _solved(task)
         _LOG.info("%s seed %d: %s", slot, seed, "kept" if solved else "not solved")
