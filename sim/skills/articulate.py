@@ -36,8 +36,8 @@ _UP: Final = np.array([0.0, 0.0, 1.0])
 _SPEED: Final = 0.45
 #: Share of the joint's range that Open leads the door to, and least share that counts as done.
 _OPEN_TO: Final = 0.95
-_OPEN_MIN: Final = 0.45
-_CLOSED_MAX: Final = 0.06
+_OPEN_MIN: Final = 0.35
+_CLOSED_MAX: Final = 0.12
 _WAYPOINTS: Final = 9
 
 
@@ -93,7 +93,7 @@ def assess_open_close(body: Body, action: Action) -> Pull:
     part = thing.moving[0]
     handle = body.world.data.site_xpos[part.handle_site].copy()
     low, high = part.range
-    goal = low + _OPEN_TO * (high - low) if opening else low
+    goal = low + (_OPEN_TO if opening else -0.04) * (high - low)  # shut means pushed against the stop
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
     grip_m = hand_shape(body.spec.name).tip_m - 0.025  # the fingertips reach a little past the bar
 
@@ -152,26 +152,55 @@ def _plan_pull(body: Body, arm: Arm, part: MovingPart, reach: Reach, hand: Array
 
 
 def open_close(body: Body, action: Action, luck: Luck) -> Skill:
-    """Open and Close: leads a door or drawer by its handle.
+    """Open and Close: leads a door or drawer by its handle; a handle that slipped on the way is taken once more.
 
     Raises:
         SkillFailure: what `assess_open_close` refuses, GraspMissed, HandleSlipped, or a contingency.
     """
-    pull = assess_open_close(body, action)
+    assert action.object_id is not None
+    thing, opening = body.thing(action.object_id), action.name == "Open"
+    outcome = ""
+    for attempt in range(2):
+        try:
+            pull = assess_open_close(body, action)
+        except SkillFailure:
+            if attempt == 0:
+                raise
+            break
+        if not outcome:
+            outcome = luck(action)
+        yield from _pull(body, action, pull, outcome)
+        if _share(body, pull.part) >= _OPEN_MIN if opening else _share(body, pull.part) <= _CLOSED_MAX:
+            return
+    raise SkillFailure(FailureCode.HANDLE_SLIPPED, {"gap_m": _share(body, thing.moving[0])})
+
+
+def _share(body: Body, part: MovingPart) -> float:
+    """How far a door or drawer is open, 0 to 1."""
+    return (float(body.world.data.qpos[part.qpos_adr]) - part.range[0]) / (part.range[1] - part.range[0])
+
+
+def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
+    """Takes the handle, leads it, lets go and goes home.
+
+    Raises:
+        SkillFailure: GraspMissed, or a contingency.
+    """
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    thing, opening, part = body.thing(action.object_id), action.name == "Open", pull.part
+    thing, part = body.thing(action.object_id), pull.part
     name = (thing.object_id,)
     yield from body.move_hand(arm, 1.0, 0.2)
     yield from body.move_arm(arm, [*pull.reach.way, pull.reach.before])
     yield from body.move_arm(arm, [pull.reach.at], speed=0.8)
     yield from body.move_hand(arm, 0.35, 0.3)
-    handle = body.part_geoms(thing, "handle")
-    gap = body.probe.hand_gap_m(arm, handle)
+    touched = body.part_geoms(thing, "handle")
+    if action.name == "Close":  # a door or drawer can also be pushed shut at its front
+        touched = np.flatnonzero(body.world.model.geom_bodyid == part.body_id)
+    gap = body.probe.hand_gap_m(arm, touched)
     if gap > GRASP_GAP_M:
         yield from _leave(body, arm, pull.reach, name)
         raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": gap})
-    outcome = luck(action)
     if outcome != "success":
         yield from wait(0.2)
         yield from _leave(body, arm, pull.reach, name)
@@ -185,10 +214,7 @@ def open_close(body: Body, action: Action, luck: Luck) -> Skill:
     away = body.solve(arm, HandPose(position - 0.08 * hand[:, 0], hand[:, 0]), start=body.commanded_arm(arm))
     if away.error_m < 0.03:
         yield from body.move_arm(arm, [away.q])
-    yield from stow(body, arm, name)
-    share = (float(body.world.data.qpos[part.qpos_adr]) - part.range[0]) / (part.range[1] - part.range[0])
-    if (opening and share < _OPEN_MIN) or (not opening and share > _CLOSED_MAX):
-        raise SkillFailure(FailureCode.HANDLE_SLIPPED, {"gap_m": share})
+    yield from stow(body, arm)
 
 
 def _lead(body: Body, arm: Arm, pull: Pull) -> Skill:
