@@ -89,6 +89,7 @@ class Expert:
         self._fruitless: list[tuple[str, _Place]] = []
         self._homes: dict[str, str] = {}
         self._gone: dict[str, set[str]] = {}
+        self._proposed = ""
         self._rehearsal = Rehearsal(session)
 
     def reset(self) -> None:
@@ -96,6 +97,7 @@ class Expert:
         self._attempts.clear()
         self._fruitless.clear()
         self._gone.clear()
+        self._proposed = ""
         self._homes = {placement.object_id: placement.receptacle for placement in self._session.task.placements or ()}
 
     def facts(self) -> Facts:
@@ -116,6 +118,11 @@ class Expert:
 
     def next_step(self) -> PlanStep:
         """The step to take from the current state; Done when every goal holds, or when nothing more can be done."""
+        step = self._plan()
+        self._proposed = step.to_text()
+        return step
+
+    def _plan(self) -> PlanStep:
         facts = self.facts()
         goals = [goal for goal in self._session.task.goals if isinstance(goal, Predicate)]
         jobs = plan_jobs(goals, facts)
@@ -150,6 +157,9 @@ class Expert:
         """Remembers what failed in the physics from where; a success changes the scene and makes all of it moot."""
         if not self._session.history:
             return
+        if self._session.history[-1].step != self._proposed:  # something else was done: stances may be as good as new
+            self._attempts.clear()
+            self._gone.clear()
         for outcome in self._session.history[-1].feedback.split("; "):
             text, _, code = outcome.rpartition(" ")
             if code in _FRUITLESS:
