@@ -37,6 +37,8 @@ _SPEED: Final = 0.45
 #: Share of the joint's range that Open leads the door to, and least share that counts as done.
 _OPEN_TO: Final = 0.95
 _OPEN_MIN: Final = 0.35
+#: Share below which Open takes the handle a second time.
+_OPEN_WELL: Final = 0.6
 _CLOSED_MAX: Final = 0.12
 _WAYPOINTS: Final = 9
 
@@ -98,6 +100,7 @@ def assess_open_close(body: Body, action: Action) -> Pull:
     grip_m = hand_shape(body.spec.name).tip_m - 0.025  # the fingertips reach a little past the bar
 
     def search() -> Pull:
+        best: Pull | None = None
         tried = 0
         for pointing in _pointings(body, arm, handle):
             wish = HandPose(handle - grip_m * pointing, pointing)
@@ -106,11 +109,13 @@ def assess_open_close(body: Body, action: Action) -> Pull:
                 continue
             tried += 1
             pull = _plan_pull(body, arm, part, reach, wish.position, goal, opening)
-            if pull is not None:
-                return pull
-            if tried > 8:
+            if pull is not None and (best is None or len(pull.positions) > len(best.positions)):
+                best = pull
+            if tried > 8 or (best is not None and len(best.positions) == _WAYPOINTS):
                 break
-        raise SkillFailure(FailureCode.OBSTRUCTED)
+        if best is None:
+            raise SkillFailure(FailureCode.OBSTRUCTED)
+        return best
 
     try:
         return search()
@@ -170,8 +175,10 @@ def open_close(body: Body, action: Action, luck: Luck) -> Skill:
         if not outcome:
             outcome = luck(action)
         yield from _pull(body, action, pull, outcome)
-        if _share(body, pull.part) >= _OPEN_MIN if opening else _share(body, pull.part) <= _CLOSED_MAX:
+        if _share(body, pull.part) >= _OPEN_WELL if opening else _share(body, pull.part) <= _CLOSED_MAX:
             return
+    if opening and _share(body, thing.moving[0]) >= _OPEN_MIN:
+        return
     raise SkillFailure(FailureCode.HANDLE_SLIPPED, {"gap_m": _share(body, thing.moving[0])})
 
 
