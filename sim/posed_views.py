@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from configs.schema.collect import CollectConfig
 from data.motion import encode_frames, world_to_heading
+from data.records import Arm
 from data.shards import encode_png
 from sim.catalogue import load_catalogue
 from sim.recorder import HISTORY_FRAMES
@@ -25,6 +26,7 @@ from sim.rendering import Renderer, View
 from sim.robots.build_solver import robot_kit
 from sim.robots.spec import SIDES
 from sim.scene import BASE_JOINTS
+from sim.skills.body import ready_posture
 from sim.skills.obstacles import navigation_map
 from sim.tasks.drafts import FAMILIES, NoDraft, draw
 from sim.tasks.sample import rng_for, scene_of
@@ -87,7 +89,7 @@ def set_pose(world: World, pose: Pose) -> None:
 
 
 def draw_pose(world: World, free: Array, rng: np.random.Generator) -> Pose:
-    """A free place, mostly facing something, any pelvis height, arms at rest, raised or anywhere."""
+    """A free place, mostly facing something, any pelvis height, arms ready, as between actions, raised or anywhere."""
     robot = world.robot
     assert robot is not None
     x, y = free[int(rng.integers(len(free)))]
@@ -109,7 +111,8 @@ def draw_pose(world: World, free: Array, rng: np.random.Generator) -> Pose:
         arm = robot.arms[side]
         rest, carry = np.asarray(arm.rest), np.asarray(arm.carry)
         kind = rng.random()
-        posture = rest if kind < 0.45 else rest + rng.random() * (carry - rest)
+        ready = ready_posture(robot.name, Arm(side))
+        posture = ready if kind < 0.55 else rest + rng.random() * (carry - rest)
         if kind > 0.75:
             limits = np.array([world.model.joint(name).range for name in arm.joints])
             posture = rest + rng.uniform(0.0, 0.6) * (rng.uniform(limits[:, 0], limits[:, 1]) - rest)
