@@ -81,7 +81,7 @@ class _Base:
 
     def _view_batch(self, rng: np.random.Generator, size: int, questions: int) -> _JointBatch:
         rows = [self._views.row(i) for i in rng.choice(self._views.split.train, size)]
-        targets = _targets(rows, self._collator, len(self._views.type_names))
+        targets = _targets(rows, len(self._views.type_names))
         if not questions:
             return _JointBatch("dense", None, self._collator.images([row.view for row in rows]), targets, 1.0)
         examples = []
@@ -91,11 +91,10 @@ class _Base:
         return _JointBatch("look", self._collator(examples), None, targets, self._cfg.dense_weight)
 
 
-def _targets(rows: Sequence[Any], collator: Collator, types: int) -> DenseTargets:
+def _targets(rows: Sequence[Any], types: int) -> DenseTargets:
     segmentation = torch.from_numpy(np.stack([row.segmentation for row in rows]))
     points = torch.from_numpy(np.stack([row.points_m for row in rows]))
     side = segmentation.shape[1] // 28
-    del collator
     return dense_targets(segmentation, points, (side, segmentation.shape[2] // 28), types)
 
 

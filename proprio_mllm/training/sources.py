@@ -26,7 +26,7 @@ from data.shards import Manifest, ShardError, ShardReader, decode_depth, decode_
 from proprio_mllm.model.batch import Example, View
 from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.prompts import Style, answers, looking, plan_prompt, with_answer
+from proprio_mllm.model.prompts import Style, answers, plan_prompt, with_answer
 from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
 
 __all__ = ["Clips", "Demos", "Views", "held_out", "shard_hash"]
@@ -221,9 +221,3 @@ class Clips:
     def caption(self, index: int, rng: np.random.Generator) -> str:
         """One of the clip's captions."""
         return self.captions[int(index)][int(rng.integers(len(self.captions[int(index)])))]
-
-
-def question_example(views: Views, row: ViewRow, pairs: Sequence[tuple[str, str]], motion: Sequence[int] | None) -> Example:
-    """A packed conversation about one view."""
-    del views
-    return Example(looking(pairs, motion), (row.view,))
