@@ -32,7 +32,7 @@ __all__ = ["collect", "main", "parts_of", "rows_of_part"]
 _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.
-_VERSION = 1
+_VERSION = 2
 
 
 def parts_of(config: CollectConfig) -> int:

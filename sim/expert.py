@@ -82,9 +82,16 @@ class Expert:
 
     privileged: Final = True
 
-    def __init__(self, session: Session) -> None:
-        """Attaches to a session."""
+    def __init__(self, session: Session, rehearsals: int | None = None) -> None:
+        """Attaches to a session.
+
+        Args:
+            session: the robot in its world.
+            rehearsals: stances it may try in thought in an episode before it gives up; no limit when None.
+        """
         self._session = session
+        self._rehearsals = rehearsals
+        self._rehearsed = 0
         self._attempts: dict[str, int] = {}
         self._fruitless: list[tuple[str, _Place]] = []
         self._homes: dict[str, str] = {}
@@ -98,6 +105,7 @@ class Expert:
         self._fruitless.clear()
         self._gone.clear()
         self._proposed = ""
+        self._rehearsed = 0
         self._homes = {placement.object_id: placement.receptacle for placement in self._session.task.placements or ()}
 
     def facts(self) -> Facts:
@@ -236,6 +244,9 @@ class Expert:
         tried = self._gone.setdefault(target, set())
         fresh = [option for option in options if option.to_text() not in tried]
         for option in fresh[:_REHEARSED]:
+            if self._rehearsals is not None and self._rehearsed >= self._rehearsals:
+                return Action("Done")
+            self._rehearsed += 1
             stance = self._rehearsal.stance_of(option)
             if stance is not None and self._rehearsal.works(actions, stance):
                 tried.add(option.to_text())

@@ -88,7 +88,12 @@ class ClearanceProbe:
             qpos[follower] = np.polyval(coefficients, qpos[leader])
 
     def depths_m(
-        self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str | int] = (), opening: float | None = None
+        self,
+        arm: Arm,
+        postures: Iterable[Array],
+        ignore: Iterable[str | int] = (),
+        opening: float | None = None,
+        limit_m: float = np.inf,
     ) -> Array:
         """Deepest penetration of forearm and hand into furniture or objects for each arm posture, other joints as they are.
 
@@ -97,6 +102,7 @@ class ClearanceProbe:
             postures: (A,) arm joints each.
             ignore: ids of objects, or numbers of geoms, that may be touched; whatever is held is ignored too.
             opening: opening of the hand, None as it is.
+            limit_m: the rest of the postures is left out after the first one deeper than this.
         """
         world, scratch, model = self._world, self._scratch, self._world.model
         allowed = {geom for geom in ignore if isinstance(geom, int)}
@@ -113,6 +119,10 @@ class ClearanceProbe:
         cargo = self._cargo(arm)
         if cargo is not None:
             mine.update(cargo.geoms)
+        touching = np.zeros(model.ngeom, dtype=bool)
+        touching[list(mine)] = True
+        barred = np.ones(model.ngeom, dtype=bool)
+        barred[list(allowed)] = False
         depths: list[float] = []
         for posture in postures:
             scratch.qpos[self._arm_adr[arm]] = posture
@@ -120,15 +130,12 @@ class ClearanceProbe:
             if cargo is not None:
                 cargo.follow(model, scratch)
             mujoco.mj_collision(model, scratch)
-            count = int(scratch.ncon)
-            worst = 0.0
-            for (a, b), deep in zip(scratch.contact.geom[:count], -scratch.contact.dist[:count], strict=True):
-                if deep <= worst or (int(a) in mine) == (int(b) in mine):
-                    continue
-                other = int(b) if int(a) in mine else int(a)
-                if other not in allowed:
-                    worst = float(deep)
-            depths.append(worst)
+            a, b = scratch.contact.geom[: scratch.ncon].T
+            other = np.where(touching[a], b, a)
+            counts = (touching[a] != touching[b]) & barred[other]
+            depths.append(max(0.0, float(-np.min(scratch.contact.dist[: scratch.ncon][counts], initial=0.0))))
+            if depths[-1] > limit_m:
+                break
         return np.array(depths)
 
     def _cargo(self, arm: Arm) -> _Cargo | None:
@@ -146,7 +153,7 @@ class ClearanceProbe:
 
     def free(self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str | int] = (), opening: float | None = None) -> bool:
         """Whether some arm postures at most touch what is around."""
-        return bool(np.all(self.depths_m(arm, postures, ignore, opening) <= TOUCH_M))
+        return bool(np.all(self.depths_m(arm, postures, ignore, opening, limit_m=TOUCH_M) <= TOUCH_M))
 
     def finger_gaps_m(self, arm: Arm, geoms: NDArray[np.int64]) -> tuple[float, float]:
         """Distance of each of the two opposing finger groups to some geoms, in the world as it is, negative inside."""
