@@ -33,6 +33,8 @@ _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.
 _VERSION = 2
+#: Fields that do not change what is written.
+_UNKEYED = {"views": ("out", "workers", "noise", "medium_share"), "demos": ("out", "workers", "views_per_world")}
 
 
 def parts_of(config: CollectConfig) -> int:
@@ -62,7 +64,7 @@ def collect(config: CollectConfig, progress: Callable[[int, int], None] | None =
     Raises:
         data.shards.ShardError: when the folder holds something else and `overwrite` is off.
     """
-    keyed = {k: v for k, v in dataclasses.asdict(config).items() if k not in ("out", "workers")} | {"version": _VERSION}
+    keyed = {k: v for k, v in dataclasses.asdict(config).items() if k not in _UNKEYED[config.kind]} | {"version": _VERSION}
     writer = ShardWriter(Path(config.out), config.kind, config_hash(keyed), overwrite)
     total = parts_of(config)
     missing = writer.missing(total)

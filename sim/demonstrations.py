@@ -80,7 +80,7 @@ def run_episode(config: CollectConfig, index: int, sessions: dict[tuple[str, str
         target = expert.next_step()
         step, origin = target, "expert"
         if rng.random() < config.noise:
-            step, origin = perturbed(target, observation, rng)
+            step, origin = perturbed(target, observation, rng, expert.intent)
         episode.rows.append(_row(observation, task, robot, index, target, {"executed": step.to_text(), "origin": origin}))
         if target.actions[0].name == "Done":
             break
@@ -89,10 +89,22 @@ def run_episode(config: CollectConfig, index: int, sessions: dict[tuple[str, str
     return episode
 
 
-def perturbed(step: PlanStep, observation: Observation, rng: np.random.Generator) -> tuple[PlanStep, str]:
-    """A step that goes a little or entirely wrong, and the name of what was done to it."""
+def perturbed(
+    step: PlanStep, observation: Observation, rng: np.random.Generator, intent: Action | None = None
+) -> tuple[PlanStep, str]:
+    """A step that goes a little or entirely wrong, and the name of what was done to it.
+
+    Args:
+        step: the right step.
+        observation: what the planner saw before it.
+        rng: draws.
+        intent: the arm action that the step works towards; `hasty` tries it at once, as learned planners do, so that the
+            demonstrations show what follows each kind of refusal.
+    """
     kinds: list[str] = ["wander", "height"]
     head = step.actions[0]
+    if intent is not None and head.spec.kind is ActionKind.BODY:
+        kinds += ["hasty"] * 5
     if head.amount is not None:
         kinds += ["amount"] * 2
     if head.spec.kind is ActionKind.ARM:
@@ -102,6 +114,8 @@ def perturbed(step: PlanStep, observation: Observation, rng: np.random.Generator
     if observation.known_objects:
         kinds += ["detour"] * 2
     kind = str(rng.choice(kinds))
+    if kind == "hasty" and intent is not None:
+        return PlanStep((intent,)), kind
     return PlanStep((_perturbation(kind, step, observation.known_objects, rng),)), kind
 
 

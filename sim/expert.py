@@ -78,6 +78,7 @@ class Expert:
 
     Attributes:
         privileged: always True; tables mark the planner with it.
+        intent: the arm action that the newest step works towards, None before the first step and when there is none.
     """
 
     privileged: Final = True
@@ -97,6 +98,7 @@ class Expert:
         self._homes: dict[str, str] = {}
         self._gone: dict[str, set[str]] = {}
         self._proposed = ""
+        self.intent: Action | None = None
         self._rehearsal = Rehearsal(session)
 
     def reset(self) -> None:
@@ -134,12 +136,14 @@ class Expert:
         facts = self.facts()
         goals = [goal for goal in self._session.task.goals if isinstance(goal, Predicate)]
         jobs = plan_jobs(goals, facts)
+        self.intent = None
         if not jobs or self._lost(jobs[0], facts):
             return _single(Action("Done"))
         self._learn()
         head = jobs[0]
         if head.target not in self._session.known_objects:
             return _single(self._find(head.target, facts))
+        self.intent = head.action(self._arms(head, facts)[0])
         verdicts: list[SkillFailure] = []
         for arm in self._arms(head, facts):
             action = head.action(arm)

@@ -37,7 +37,7 @@ class CollectConfig:
     part_size: int = 240
     workers: int = 1
     views_per_world: int = 48
-    noise: float = 0.15
+    noise: float = 0.2
     medium_share: float = 0.15
 
     def __post_init__(self) -> None:
