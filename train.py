@@ -80,12 +80,13 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
 
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
-    pipeline = Pipeline(cfg, _rollouts)
+    command = " ".join(["python train.py", *sys.argv[1:]])
+    pipeline = Pipeline(cfg, _rollouts, command)
     metrics = {name: pipeline.run(name) for name in wanted}
     if cfg.release is not None:
         from proprio_mllm.training.release import export
 
-        export(pipeline, cfg.release, " ".join(["python train.py", *sys.argv[1:]]))
+        export(pipeline, cfg.release)
     return metrics
 
 

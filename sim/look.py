@@ -1,6 +1,7 @@
-"""Pictures of every room and of all object types, for the eye: `python -m sim.look [folder]`.
+"""Pictures of rooms, object types and robots, for the eye: `python -m sim.look [folder]`.
 
-Writes each room from above and through the robot's head camera, and a contact sheet of the types. Not part of any experiment.
+Writes each room from above and through the robot's head camera, a contact sheet of the types, and each robot standing, crouching
+and holding a plant with both hands. Not part of any experiment.
 """
 
 from __future__ import annotations
@@ -13,13 +14,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from data.records import Action, PlanStep
 from sim.catalogue import load_catalogue
+from sim.expert import Expert
 from sim.robots.spec import load_robot
 from sim.rooms import room_names
 from sim.scene import build_type_spec
+from sim.session import Session
+from sim.tasks.task import load_benchmark
 from sim.world import World
 
-__all__ = ["contact_sheet", "main", "room_pictures"]
+__all__ = ["contact_sheet", "main", "robot_poses", "room_pictures"]
 
 
 def room_pictures(folder: Path, robot: str = "h1") -> list[Path]:
@@ -49,6 +54,38 @@ def contact_sheet(size: int = 112, columns: int = 12) -> NDArray[np.uint8]:
     return np.concatenate([np.concatenate(tiles[r * columns : (r + 1) * columns], axis=1) for r in range(rows)], axis=0)
 
 
+def robot_poses(robot: str, size: int = 420) -> NDArray[np.uint8]:
+    """(size, 3 * size, 3) the robot standing, crouching as low as it can, and holding a plant with both hands."""
+    session = Session(robot)
+    task = next(task for task in load_benchmark() if task.family == "lift" and task.room == "living_room_1")
+    session.reset(task, seed=0)
+    low, high = session.body.spec.pelvis_height_range_m
+    pictures = []
+    for height in (high, low):
+        change = height - session.body.pelvis_height_m
+        if abs(change) > 0.005:
+            session.act(PlanStep((Action("MoveUp" if change > 0 else "MoveDown", amount=round(abs(change), 2)),)))
+        pictures.append(_portrait(session, size))
+    session.reset(task, seed=0)
+    expert = Expert(session)
+    expert.reset()
+    while session.body.lifted is None and not session.finished:
+        session.step(expert.next_step())
+    return np.concatenate([*pictures, _portrait(session, size)], axis=1)
+
+
+def _portrait(session: Session, size: int) -> NDArray[np.uint8]:
+    """The robot from its front left, without the walls between."""
+    world, base = session.world, session.body.base()
+    camera = mujoco.MjvCamera()
+    tall_m = session.body.spec.standing_pelvis_height_m
+    camera.lookat[:] = [base.x, base.y, 0.9 * tall_m]
+    camera.distance, camera.azimuth, camera.elevation = 1.0 + 2.1 * tall_m, np.rad2deg(base.yaw_rad) + 215.0, -12.0
+    with mujoco.Renderer(world.model, size, size) as renderer:
+        renderer.update_scene(world.data, camera)
+        return renderer.render().copy()
+
+
 def _tile(type_name: str, size: int) -> NDArray[np.uint8]:
     model = build_type_spec(type_name).compile()
     data = mujoco.MjData(model)
@@ -63,7 +100,11 @@ def main(folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     sheet = folder / "types.png"
     iio.imwrite(sheet, contact_sheet())
-    return [sheet, *room_pictures(folder)]
+    written = [sheet, *room_pictures(folder)]
+    for robot in ("h1", "x1"):
+        written.append(folder / f"{robot}_poses.png")
+        iio.imwrite(written[-1], robot_poses(robot))
+    return written
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from sim.robots.spec import load_robot
 __all__ = ["main", "strip"]
 
 mpl.use("Agg")
-_SIZE = 300
+_SIZE = 240
 
 
 def _human(joints: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -52,6 +52,10 @@ def _robot(retargeter: Retargeter, clip: HumanMotion, frames: list[int]) -> list
     assert motion.joint_positions is not None
     spec = mujoco.MjSpec.from_file(str(retargeter.spec.mjcf_path))
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[4, 4, 0.1], rgba=[0.8, 0.8, 0.8, 1])
+    spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        width=32, height=32, rgb1=[0.93, 0.94, 0.96],
+    )  # fmt: skip
     for side in (-1.0, 1.0):
         spec.worldbody.add_light(
             pos=[3.0, 2.0 * side, 3.0],

@@ -59,8 +59,9 @@ def finished_key(folder: Path) -> str | None:
     return str(json.loads(path.read_text(encoding="utf-8"))["key"])
 
 
-def finish(folder: Path, key: str, metrics: Mapping[str, Any]) -> None:
-    """Marks a stage's output as complete."""
+def finish(folder: Path, key: str, metrics: Mapping[str, Any], command: str = "") -> None:
+    """Marks a stage's output as complete; `command` is the command line that made it."""
     temporary = folder / "done.json.tmp"
-    temporary.write_text(json.dumps({"key": key, "metrics": dict(metrics)}, indent=1) + "\n", encoding="utf-8")
+    record = {"key": key, "command": command, "metrics": dict(metrics)}
+    temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     os.replace(temporary, folder / "done.json")

@@ -73,10 +73,12 @@ class Pipeline:
         cfg: configuration.
         collect_rollouts: runs an actor in the simulator and writes `rollouts` shards; given by the entry point, because
             training does not know the simulator.
+        command: the command line, stored with every finished stage.
     """
 
-    def __init__(self, cfg: TrainConfig, collect_rollouts: Callable[..., Any] | None = None) -> None:
+    def __init__(self, cfg: TrainConfig, collect_rollouts: Callable[..., Any] | None = None, command: str = "") -> None:
         self.cfg = cfg
+        self.command = command
         self.paths = StagePaths(cfg)
         self._collect = collect_rollouts
         self._taken: Metrics = {}  # steps of each run of the current stage: a time budget may end it early
@@ -119,7 +121,7 @@ class Pipeline:
         self._taken.clear()
         metrics = STAGES[name](self, folder, key) | self._taken
         metrics["seconds"] = round(time.monotonic() - began, 1)
-        finish(folder, key, metrics)
+        finish(folder, key, metrics, self.command)
         logger.info("%s: %s", name, ", ".join(f"{k} {v:.4g}" for k, v in metrics.items()))
         return metrics
 

@@ -1,7 +1,8 @@
 """Released weights: a finished stage's model as a small folder with where it comes from, and how a loader finds it.
 
     weights/<model>/<name>/     what `building.save_model` wrote, and
-        provenance.json         command, seed, stage, keys and hashes of data and configuration, metrics, versions
+        provenance.json         seed, keys and hashes of data and configuration, versions, and for every stage that went into
+                                the model its command and its metrics
 
 Weights are stored as float16, half the size; they are read back as float32. The motion tokenizer keeps its precision, so that
 it gives the same tokens as in training, and the critic of stage 3 is left out: a planner does not need it. Git is not asked:
@@ -33,6 +34,12 @@ __all__ = ["LARGEST_MB", "export", "find_model", "release_name"]
 #: Largest size of one released folder, megabytes.
 LARGEST_MB: Final = 30.0
 _MODELS: Final = ("base", "alignment", "selu")
+#: Stages that go into each released model, in order.
+_CHAIN: Final = {
+    "base": ("base",),
+    "alignment": ("base", "pointmap", "tokenizer", "alignment"),
+    "selu": ("base", "pointmap", "tokenizer", "alignment", "selu"),
+}
 
 
 def release_name(stage: str, variant: str) -> str:
@@ -40,13 +47,12 @@ def release_name(stage: str, variant: str) -> str:
     return {"base": "base", "selu": variant}.get(stage, f"{variant}-{stage}")
 
 
-def export(pipeline: Pipeline, folder: str | Path, command: str) -> list[Path]:
+def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
     """Copies every finished model of a pipeline's configuration to `folder/<model>/<name>`.
 
     Args:
         pipeline: names folders and keys.
         folder: such as `weights`.
-        command: the command line that made them.
 
     Returns:
         The written folders.
@@ -64,8 +70,7 @@ def export(pipeline: Pipeline, folder: str | Path, command: str) -> list[Path]:
         shutil.rmtree(work, ignore_errors=True)
         shutil.copytree(source, work)
         _shrink(work)
-        metrics = json.loads((paths.stage(stage) / "done.json").read_text(encoding="utf-8"))["metrics"]
-        (work / "provenance.json").write_text(json.dumps(_provenance(pipeline, stage, key, command, metrics), indent=1) + "\n")
+        (work / "provenance.json").write_text(json.dumps(_provenance(pipeline, stage, key), indent=1) + "\n", encoding="utf-8")
         size = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) / 1e6
         if size > LARGEST_MB:
             shutil.rmtree(work)
@@ -89,20 +94,23 @@ def _shrink(folder: Path) -> None:
         save_file(tensors, path, {"format": "pt"})
 
 
-def _provenance(pipeline: Pipeline, stage: str, key: str, command: str, metrics: dict[str, Any]) -> dict[str, Any]:
+def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
     shards = {}
     for kind in ("clips", "views", "demos"):
         folder = pipeline.paths.shards(kind)
         if (folder / "manifest.json").is_file():
             shards[kind] = shard_hash(folder)
+    stages = {}
+    for name in _CHAIN[stage]:
+        record = json.loads((pipeline.paths.stage(name) / "done.json").read_text(encoding="utf-8"))
+        stages[name] = {"command": record.get("command", ""), "metrics": record["metrics"]}
     return {
         "stage": stage,
         "variant": pipeline.cfg.variant,
         "key": key,
-        "command": command,
         "seed": pipeline.cfg.seed,
         "shards": shards,
-        "metrics": metrics,
+        "stages": stages,
         "stored_as": "float16",
         "config": dataclasses.asdict(pipeline.cfg),
         "versions": {name: version(name) for name in ("torch", "transformers", "peft")} | {"python": platform.python_version()},

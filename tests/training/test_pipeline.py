@@ -71,7 +71,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
     small = dataclasses.replace(cfg, model=_small(cfg.model))
     (root / "tiny").mkdir()
     (root / "tiny" / "data").symlink_to(shards, target_is_directory=True)
-    pipeline = Pipeline(small, collect)
+    pipeline = Pipeline(small, collect, "python train.py stage=all")
     for stage in ("base", "pointmap", "tokenizer", "alignment", "selu"):
         assert pipeline.run(stage) is not None
     return pipeline
@@ -186,10 +186,11 @@ def test_variants() -> None:
 
 
 def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    written = release.export(trained, tmp_path, "python train.py stage=all")
+    written = release.export(trained, tmp_path)
     assert [folder.name for folder in written] == ["base", "full-alignment", "full"]
     about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
-    assert about["command"] == "python train.py stage=all"
+    assert list(about["stages"]) == ["base", "pointmap", "tokenizer", "alignment", "selu"]
+    assert all(stage["command"] == "python train.py stage=all" and stage["metrics"] for stage in about["stages"].values())
     assert set(about["shards"]) == {"clips", "views", "demos"}
     ours, released = load_model(trained.paths.model("selu")), load_model(tmp_path / "tiny" / "full")
     theirs = dict(released.named_parameters())
@@ -204,7 +205,7 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         release.find_model("nowhere", tmp_path, "tiny", "no_cse", "selu")
     monkeypatch.setattr(release, "LARGEST_MB", 0.001)
     with pytest.raises(ValueError, match=r"at most 0.001 MB are released"):
-        release.export(trained, tmp_path, "x")
+        release.export(trained, tmp_path)
 
 
 def test_rollouts_refuse_the_benchmark(tmp_path: Path) -> None:
