@@ -70,7 +70,7 @@ class AlignmentData:
     def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> Batch:
         """A batch of one kind from the training rows."""
         if kind == "plan":
-            rows = rng.choice(self.demos.split.train, size)
+            rows = self.demos.draw(rng, size)
             return self._collator([self._plan(int(i), rng) for i in rows])
         if kind == "body":
             return self._collator([self._body(int(i), rng) for i in rng.choice(self.views.split.train, size)])

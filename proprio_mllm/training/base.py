@@ -123,7 +123,7 @@ class JointObjective(_Base):
             return self._view_batch(rng, size, self._cfg.questions)
         examples = [
             judge_example(self._demos, i, rng, None) if rng.random() < self._cfg.judge_share else self._demos.example(i, None)
-            for i in rng.choice(self._demos.split.train, size)
+            for i in self._demos.draw(rng, size)
         ]
         return _JointBatch("plan", self._collator(examples), None, None, 0.0)
 

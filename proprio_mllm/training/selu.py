@@ -151,11 +151,11 @@ class _Selu:
         return None if self._tokens is None else self._tokens[index].tolist()
 
     def _judging(self, rng: np.random.Generator) -> Example:
-        index = int(rng.choice(self.demos.split.train))
+        index = int(self.demos.draw(rng, 1)[0])
         return judge_example(self.demos, index, rng, self._tokens)
 
     def _planning(self, rng: np.random.Generator) -> Example:
-        index = int(rng.choice(self.demos.split.train))
+        index = int(self.demos.draw(rng, 1)[0])
         return self.demos.example(index, self._codes(index))
 
     def tune(self, adapter: str, name: str, examples: Sequence[Example], loop: LoopConfig, share: float, folder: Path) -> None:

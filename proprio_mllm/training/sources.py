@@ -159,6 +159,13 @@ class Demos:
         self.finals = np.intersect1d([index for _, index in last.values()], self.split.train)
         self.style: Style = cfg.prompt
         self._cfg = cfg
+        categories = np.asarray(self.reader.column("category"))[self.split.train]
+        self._by_category = [self.split.train[categories == name] for name in sorted(set(categories))]
+
+    def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
+        """Training rows (size,), every category as often: the expert's successes are fewer where tasks are harder."""
+        chosen = rng.integers(len(self._by_category), size=size)
+        return np.array([rng.choice(self._by_category[c]) for c in chosen], dtype=np.int64)
 
     def tokens(self, tokenizer: MotionTokenizer) -> NDArray[np.int64]:
         """Motion tokens (N, T / stride) of every row's window."""
