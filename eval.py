@@ -28,7 +28,7 @@ def main(overrides: Sequence[str]) -> int:
         overrides: `key=value` pairs of `configs/eval.yaml`.
 
     Returns:
-        0; 1 when episodes stay without a score or weights are absent; 2 on a wrong key or value.
+        0; 1 when episodes stay without a score, weights are absent or a stored run cannot be read; 2 on a wrong key or value.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     console = Console(stderr=True, highlight=False)
@@ -43,7 +43,11 @@ def main(overrides: Sequence[str]) -> int:
     from proprio_mllm.report.runs import load_run, write_report
 
     if cfg.experiment is not None:
-        table, files = assemble(cfg.experiment, Path(cfg.output))
+        try:
+            table, files = assemble(cfg.experiment, Path(cfg.output))
+        except ValueError as error:
+            console.print(f"eval.py: {error}", style="red", markup=False, soft_wrap=True)
+            return 1
         console.print("\n".join(f"written: {path}" for path in files), markup=False, soft_wrap=True)
         if table is not None:
             table.show()

@@ -76,7 +76,7 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
         return {}
     import torch
 
-    from proprio_mllm.training.pipeline import Pipeline
+    from proprio_mllm.training.pipeline import Pipeline, StageError
 
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
@@ -86,7 +86,10 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
     if cfg.release is not None:
         from proprio_mllm.training.release import export
 
-        export(pipeline, cfg.release)
+        try:
+            export(pipeline, cfg.release)
+        except ValueError as error:
+            raise StageError(str(error)) from error
     return metrics
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Final
 
@@ -315,6 +315,10 @@ class Feedback:
     def success(self) -> bool:
         """Whether every action of the step succeeded."""
         return all(outcome.success for outcome in self.outcomes)
+
+    def public(self) -> Feedback:
+        """The feedback without what a planner must not know: margins and the draws of the contingency."""
+        return replace(self, outcomes=tuple(replace(outcome, margins={}, contingency="") for outcome in self.outcomes))
 
     def to_text(self) -> str:
         """What a planner reads: each action with `ok` or its failure code; never a margin."""

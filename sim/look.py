@@ -1,7 +1,7 @@
 """Pictures of rooms, object types and robots, for the eye: `python -m sim.look [folder]`.
 
-Writes each room from above and through the robot's head camera, a contact sheet of the types, and each robot standing, crouching
-and holding a plant with both hands. Not part of any experiment.
+Writes each room from above and through the robot's head camera, a contact sheet of the types, and each robot standing,
+crouching and holding a plant with both hands. Not part of any experiment.
 """
 
 from __future__ import annotations

@@ -178,7 +178,7 @@ class TrainConfig:
         output: folder of all outputs.
         seed: seed of data order, initial weights and rollouts.
         threads: torch threads; 0 leaves torch's choice.
-        overwrite: run a stage again although its output is current.
+        overwrite: run a stage from its start although its output is current, or a checkpoint is there.
         release: folder the finished stages are exported to, None for no export.
         resume: continue an interrupted stage from its checkpoint.
         data: where motions come from, and what is kept of them.

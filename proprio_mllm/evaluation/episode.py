@@ -168,7 +168,7 @@ def _loop(
         shown = _shown(observation, history, number, step_budget)
         if watch is not None:
             watch(shown, reply, feedback)
-        reply = planner.step(shown, feedback)
+        reply = planner.step(shown, None if feedback is None else feedback.public())
         tally.calls += 1
         tally.tokens += reply.tokens
         tally.planner_s += reply.latency_s

@@ -24,7 +24,7 @@ from proprio_mllm.model.geometry import centroid
 from proprio_mllm.model.mpe import Centroid, position_ids
 from proprio_mllm.model.processor import ProprioProcessor
 
-__all__ = ["Batch", "Collator", "Example", "ImageBatch", "View"]
+__all__ = ["Batch", "Collator", "Example", "ImageBatch", "Movable", "View"]
 
 IGNORE = -100
 
@@ -54,7 +54,7 @@ class Example:
     views: tuple[View, ...] = ()
 
 
-class _Movable:
+class Movable:
     """Moves every tensor of a dataclass."""
 
     def to(self, device: torch.device | str) -> Self:
@@ -62,13 +62,13 @@ class _Movable:
         moved = {}
         for f in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
             value = getattr(self, f.name)
-            if isinstance(value, (Tensor, _Movable)):
+            if isinstance(value, (Tensor, Movable)):
                 moved[f.name] = value.to(device)
         return replace(self, **moved)  # type: ignore[type-var]  # every subclass is a dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class ImageBatch(_Movable):
+class ImageBatch(Movable):
     """Images of one size.
 
     Attributes:
@@ -91,7 +91,7 @@ class ImageBatch(_Movable):
 
 
 @dataclass(frozen=True, slots=True)
-class Batch(_Movable):
+class Batch(Movable):
     """Model inputs.
 
     Attributes:

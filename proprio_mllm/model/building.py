@@ -215,7 +215,9 @@ def save_model(model: ProprioMLLM, folder: str | Path, motion: MotionTokenizer |
     work.mkdir(parents=True)
     model.processor.save_pretrained(str(work / "processor"))
     state = backbone_state(model)
-    heads = {k: v for k, v in model.state_dict().items() if k.startswith(("cse.", "mpe.", "point_map."))}
+    # CUT3R's weights stay where the user has them: their licence does not let them travel with a model
+    kept = ("cse.", "mpe.") if model.cfg.point_map.encoder == "cut3r" else ("cse.", "mpe.", "point_map.")
+    heads = {k: v for k, v in model.state_dict().items() if k.startswith(kept)}
     if model.cfg.weights is None:
         (work / "vlm").mkdir()
         if model.core.config.tie_word_embeddings:
@@ -268,7 +270,8 @@ def load_model(folder: str | Path, adapter: str | None = None, trainable: bool =
     merger = {k.removeprefix("backbone."): v for k, v in heads.items() if k.startswith("backbone.")}
     model.core.load_state_dict(merger, strict=False)
     own = {k: v for k, v in heads.items() if not k.startswith("backbone.")}
-    missing = [k for k in model.load_state_dict(own, strict=False).missing_keys if not k.startswith("vlm.")]
+    elsewhere = ("vlm.", "point_map.") if cfg.point_map.encoder == "cut3r" else ("vlm.",)
+    missing = [k for k in model.load_state_dict(own, strict=False).missing_keys if not k.startswith(elsewhere)]
     if missing:
         raise ValueError(f"{folder}/heads.safetensors lacks {missing[:3]}")
     names: list[str] = stored["adapters"]

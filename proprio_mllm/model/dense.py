@@ -17,13 +17,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from proprio_mllm.model.batch import Movable
 from proprio_mllm.model.modeling import ProprioMLLM
 
 __all__ = ["DenseHead", "DenseLoss", "DenseTargets", "dense_targets"]
 
 
 @dataclass(frozen=True, slots=True)
-class DenseTargets:
+class DenseTargets(Movable):
     """Truth per cell.
 
     Attributes:

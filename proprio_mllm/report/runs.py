@@ -129,12 +129,15 @@ def _write(path: Path, text: str) -> None:
 
 
 def newest(runs: Sequence[Run], planner: str, robot: str, difficulty: str, category: str = "all") -> Run | None:
-    """The run to show in a cell: of these settings, with tasks of the category, the one with most episodes, then the newest."""
+    """The run to show in a cell: of these settings, with tasks of the category, the one with most episodes, then the newest.
+
+    Runs over a part of the tasks (`limit`) or from other start poses are left out.
+    """
     fitting = [
         run
         for run in runs
         if (run.metadata["planner"], run.metadata["robot"], run.metadata["difficulty"]) == (planner, robot, difficulty)
-        and run.metadata["tasks"] == "benchmark"
+        and (run.metadata["tasks"], run.metadata["limit"], run.metadata["start"]) == ("benchmark", None, "fixed")
         and run.row(category) is not None
     ]
     return max(fitting, key=lambda run: len(run.records), default=None)  # `runs` is newest first, and max keeps the first

@@ -65,7 +65,7 @@ class AlignmentData:
         self._pictured = np.intersect1d(np.asarray(with_images, dtype=np.int64), clips.split.train)
 
     def _encode(self, windows: NDArray[np.float32]) -> list[list[int]]:
-        return self.tokenizer.encode(torch.from_numpy(windows)).tolist()
+        return self.tokenizer.encode(torch.from_numpy(windows).to(self.tokenizer.mean.device)).tolist()
 
     def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> Batch:
         """A batch of one kind from the training rows."""

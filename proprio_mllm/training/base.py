@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from configs.schema.train import BaseConfig
-from proprio_mllm.model.batch import Batch, Collator, Example, ImageBatch
+from proprio_mllm.model.batch import Batch, Collator, Example, ImageBatch, Movable
 from proprio_mllm.model.dense import DenseHead, DenseTargets, dense_targets
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
@@ -57,7 +57,7 @@ class _WithDense(nn.Module):
 
 
 @dataclass(frozen=True, slots=True)
-class _JointBatch:
+class _JointBatch(Movable):
     kind: Literal["dense", "look", "plan"]
     text: Batch | None
     images: ImageBatch | None
@@ -163,7 +163,7 @@ def grounding_accuracy(
         right = 0
         for start in range(0, len(asked), 16):
             chunk = asked[start : start + 16]
-            replies = model.reply(collator([example for example, _ in chunk], generation=True), 10)
+            replies = model.reply(collator([example for example, _ in chunk], generation=True).to(model.device), 10)
             right += sum(reply.strip() == answer for reply, (_, answer) in zip(replies, chunk, strict=True))
         answers = [answer for _, answer in asked]
         result[f"{kind}_accuracy"] = right / len(asked)
@@ -182,7 +182,8 @@ def plan_accuracy(model: ProprioMLLM, demos: Demos, tokens: Any = None, limit: i
     for start in range(0, len(order), 16):
         chunk = [int(i) for i in order[start : start + 16]]
         examples = [demos.example(i, None if motion is None else motion[i].tolist(), answered=False) for i in chunk]
-        for index, reply in zip(chunk, model.reply(collator(examples, generation=True), 40), strict=True):
+        batch = collator(examples, generation=True).to(model.device)
+        for index, reply in zip(chunk, model.reply(batch, 40), strict=True):
             target = demos.target(index)
             exact += reply.strip() == target
             verb += reply.split("(")[0].strip() == target.split("(")[0]

@@ -56,7 +56,8 @@ def point_map_error(encoder: nn.Module, views: Views, limit: int = 200, far_m: f
     errors, shares = [], []
     for start in range(0, min(limit, len(views.split.test)), 32):
         rgb, points = _stack(views, views.split.test[start : min(start + 32, limit)])
-        predicted = encoder(rgb).points_m  # (I, h, w, 3)
+        device = next(encoder.parameters()).device
+        predicted = encoder(rgb.to(device)).points_m.cpu()  # (I, h, w, 3)
         rows = ((torch.arange(predicted.shape[1]) + 0.5) * points.shape[1] / predicted.shape[1]).long()
         cols = ((torch.arange(predicted.shape[2]) + 0.5) * points.shape[2] / predicted.shape[2]).long()
         truth = points[:, rows][:, :, cols]

@@ -89,7 +89,7 @@ def tokenizer_metrics(tokenizer: MotionTokenizer, windows: MotionWindows, seed: 
     for name, rows in (("clips", np.stack(clips) if clips else None), ("windows", windows.test[:512])):
         if rows is None or len(rows) == 0:
             continue
-        truth = torch.from_numpy(rows)
+        truth = torch.from_numpy(rows).to(tokenizer.mean.device)
         ids = tokenizer.encode(truth)
         used |= set(ids.flatten().tolist())
         rebuilt = tokenizer.decode(ids)
@@ -99,7 +99,7 @@ def tokenizer_metrics(tokenizer: MotionTokenizer, windows: MotionWindows, seed: 
         result[f"{name}_hands_feet_mm"] = 1000.0 * float(error[..., HANDS_AND_FEET].mean())
         result[f"{name}_height_mm"] = 1000.0 * float((rebuilt[..., keys] - truth[..., keys]).abs().mean())
         result[f"{name}_count"] = float(len(rows))
-    sample = torch.from_numpy(windows.draw(rng, 512))
+    sample = torch.from_numpy(windows.draw(rng, 512)).to(tokenizer.mean.device)
     counts = torch.bincount(tokenizer.encode(sample).flatten(), minlength=tokenizer.cfg.codes).double()
     share = counts / counts.sum()
     result["codes_used"] = float((counts > 0).double().mean())

@@ -130,7 +130,7 @@ class Pipeline:
         folder.mkdir(parents=True, exist_ok=True)
         writer = MetricWriter(folder, objective.name, self.cfg.logger, {"key": objective.key})
         try:
-            result = run_loop(objective, cfg, folder, self.cfg.seed, writer, self.cfg.resume)
+            result = run_loop(objective, cfg, folder, self.cfg.seed, writer, self.cfg.resume and not self.cfg.overwrite)
             self._taken[f"{objective.name}/steps"] = float(result.steps)
         finally:
             writer.close()

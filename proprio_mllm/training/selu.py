@@ -169,7 +169,7 @@ class _Selu:
     def round(self, number: int) -> dict[str, float]:
         """One round; its folder holds rollouts, the two runs, the model and its metrics."""
         folder, key = self.folder / f"round_{number}", f"{self.key}/{number}"
-        if finished_key(folder) == key:
+        if finished_key(folder) == key and not self.pipeline.cfg.overwrite:
             logger.info("selu: round %d is complete", number)
             return json.loads((folder / "done.json").read_text(encoding="utf-8"))["metrics"]
         before = self.start if number == 0 else self.folder / f"round_{number - 1}" / "model"

@@ -170,8 +170,9 @@ class Demos:
     def tokens(self, tokenizer: MotionTokenizer) -> NDArray[np.int64]:
         """Motion tokens (N, T / stride) of every row's window."""
         with torch.no_grad():
-            chunks = [tokenizer.encode(torch.from_numpy(self.motions[i : i + 256])) for i in range(0, len(self.motions), 256)]
-        return torch.cat(chunks).numpy()
+            device = tokenizer.mean.device
+            parts = [torch.from_numpy(self.motions[i : i + 256]).to(device) for i in range(0, len(self.motions), 256)]
+            return torch.cat([tokenizer.encode(part) for part in parts]).cpu().numpy()
 
     def example(self, index: int, motion: Sequence[int] | None, answered: bool = True) -> Example:
         """The step's conversation; `motion` None leaves proprioception out of the prompt."""
