@@ -39,13 +39,13 @@ _GREY, _ORANGE, _BLUE = "#999999", "#ee8866", "#4477aa"
 
 
 @torch.no_grad()
-def reconstruct(tokenizer: MotionTokenizer, window: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def reconstruct(tokenizer: MotionTokenizer, window: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Key bodies (T, K, 3) of a window (T, F) and of its reconstruction, metres, pelvis heading frame."""
     rebuilt = tokenizer.decode(tokenizer.encode(torch.from_numpy(window[None])))[0].numpy()
-    return decode_key_bodies(window.astype(np.float64)), decode_key_bodies(rebuilt.astype(np.float64))
+    return decode_key_bodies(window), decode_key_bodies(rebuilt)
 
 
-def draw_reconstruction(pairs: Sequence[tuple[str, NDArray[np.float64], NDArray[np.float64]]]) -> Figure:
+def draw_reconstruction(pairs: Sequence[tuple[str, NDArray[np.float32], NDArray[np.float32]]]) -> Figure:
     """A figure with one row per (title, true key bodies, rebuilt key bodies)."""
     figure = Figure(figsize=(13.0, 2.7 * len(pairs)), layout="constrained")
     FigureCanvasAgg(figure)
