@@ -73,7 +73,8 @@ class BaseConfig:
         dense: loop of the dense, name-tied pretraining of the vision tower.
         joint: loop of the mixed batches.
         questions: question and answer pairs packed per image.
-        plan_share: share of the joint batches that are planning demonstrations.
+        plan_share: share of the joint batches that are planning demonstrations or exercises.
+        exercise_share: share of exercises in text alone among them.
         judge_share: share of judging questions among the planning demonstrations.
         dense_weight: weight of the dense loss on the joint batches' views.
     """
@@ -81,12 +82,13 @@ class BaseConfig:
     dense: LoopConfig
     joint: LoopConfig
     questions: int = 8
-    plan_share: float = 0.6
+    plan_share: float = 0.7
+    exercise_share: float = 0.5
     judge_share: float = 0.15
     dense_weight: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("plan_share", "judge_share"):
+        for name in ("plan_share", "exercise_share", "judge_share"):
             _require(0.0 <= getattr(self, name) <= 1.0, f"{name} {getattr(self, name)} outside [0, 1]")
         _require(self.questions > 0, f"questions {self.questions} must be positive")
 

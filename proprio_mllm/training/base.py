@@ -2,7 +2,8 @@
 
 Three parts, each needed (a small model trained on questions alone never binds words to image regions): dense, name-tied
 pretraining of the vision tower on the simulator's truth; grounding questions packed per image and image-to-text listing;
-planning demonstrations without proprioception, with judging questions about the expert's logs among them. Its result is also
+planning demonstrations without proprioception, with judging questions about the expert's logs among them, and exercises in
+text alone on the same logs (`exercises`). Its result is also
 the table row "Qwen2.5-VL-Ins" at this size. The paper has no such stage.
 """
 
@@ -58,7 +59,7 @@ class _WithDense(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class _JointBatch(Movable):
-    kind: Literal["dense", "look", "plan"]
+    kind: Literal["dense", "look", "plan", "exercise"]
     text: Batch | None
     images: ImageBatch | None
     dense: DenseTargets | None
@@ -86,7 +87,8 @@ class _Base:
             return _JointBatch("dense", None, self._collator.images([row.view for row in rows]), targets, 1.0)
         examples = []
         for row in rows:
-            pairs = [self._views.listing(row), *self._views.pairs(row, GROUNDING, questions, rng)]
+            # the list comes last: its order, from left to right, would give away where things are
+            pairs = [*self._views.pairs(row, GROUNDING, questions, rng), self._views.listing(row)]
             examples.append(Example(looking(pairs), (row.view,)))
         return _JointBatch("look", self._collator(examples), None, targets, self._cfg.dense_weight)
 
@@ -121,6 +123,8 @@ class JointObjective(_Base):
         """A batch of views or of planning steps."""
         if rng.random() >= self._cfg.plan_share:
             return self._view_batch(rng, size, self._cfg.questions)
+        if rng.random() < self._cfg.exercise_share:
+            return _JointBatch("exercise", self._collator([self._demos.exercise(rng) for _ in range(size)]), None, None, 0.0)
         examples = [
             judge_example(self._demos, i, rng, None) if rng.random() < self._cfg.judge_share else self._demos.example(i, None)
             for i in self._demos.draw(rng, size)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,12 @@ from data.motion import KEY_BODY_COUNT
 from data.records import Camera, HistoryItem
 from data.shards import Manifest, ShardError, ShardReader, decode_depth, decode_motion, decode_png, decode_segmentation
 from proprio_mllm.model.batch import Example, View
+from proprio_mllm.model.chat import Message
 from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, answers, plan_prompt, with_answer
 from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
+from proprio_mllm.training.exercises import Exchange, is_symbolic
 
 __all__ = ["Clips", "Demos", "Views", "held_out", "shard_hash"]
 
@@ -162,6 +164,9 @@ class Demos:
         categories = np.asarray(self.reader.column("category"))[self.split.train]
         self._by_category = [self.split.train[categories == name] for name in sorted(set(categories))]
 
+        targets = self.reader.column("target")
+        self._symbolic = np.array([i for i in self.split.train if is_symbolic(targets[int(i)])], dtype=np.int64)
+
     def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
         """Training rows (size,), every category as often: the expert's successes are fewer where tasks are harder."""
         chosen = rng.integers(len(self._by_category), size=size)
@@ -177,7 +182,18 @@ class Demos:
     def example(self, index: int, motion: Sequence[int] | None, answered: bool = True) -> Example:
         """The step's conversation; `motion` None leaves proprioception out of the prompt."""
         row = self.reader[int(index)]
-        prompt = plan_prompt(
+        prompt = self._prompt(row, motion)
+        return Example(with_answer(prompt, row["target"]) if answered else prompt, (self.view(row),))
+
+    def exercise(self, rng: np.random.Generator) -> Example:
+        """A step in text alone, names exchanged (see `exercises`)."""
+        row = self.reader[int(rng.choice(self._symbolic))]
+        exchanged = Exchange.draw(rng).row(row)
+        messages = [replace(message, images=0) for message in self._prompt(exchanged, None)]
+        return Example(with_answer(messages, exchanged["target"]))
+
+    def _prompt(self, row: Mapping[str, Any], motion: Sequence[int] | None) -> tuple[Message, ...]:
+        return plan_prompt(
             row["instruction"],
             row["robot"],
             row["visible"],
@@ -189,7 +205,6 @@ class Demos:
             self._cfg.prompt,
             self._cfg.history,
         )
-        return Example(with_answer(prompt, row["target"]) if answered else prompt, (self.view(row),))
 
     def view(self, row: Mapping[str, Any]) -> View:
         """The head-camera view of a row."""
