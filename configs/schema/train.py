@@ -101,7 +101,8 @@ class AlignmentConfig:
         text: loop of phase 2a-i, motion and text; vision and CSE frozen.
         image: loop of phase 2a-ii, motion and image; the language model's LoRA frozen.
         joint: loop of phase 2b; rows, LoRA, CSE and merger train.
-        plan_share: share of the joint batches that are planning demonstrations with proprioception.
+        plan_share: share of the joint batches that are planning demonstrations with proprioception, or exercises.
+        exercise_share: share of exercises in text alone among them.
         judge_share: share of judging questions among the planning demonstrations.
         questions: body-relative questions packed per image.
         mask: share of motion tokens hidden in masked motion.
@@ -111,6 +112,7 @@ class AlignmentConfig:
     image: LoopConfig
     joint: LoopConfig
     plan_share: float = 0.7
+    exercise_share: float = 0.3
     judge_share: float = 0.15
     questions: int = 6
     mask: float = 0.3

@@ -9,7 +9,8 @@
 "Freeze the image and text weights separately" leaves open which weights; this reading freezes one modality's while the other's
 pairs train. Besides clip captions, motion and image to text holds questions about the robot's own body in its scene (which arm
 reaches an object, how far the body must go down). A share of planning demonstrations, with motion tokens in the prompt, keeps
-the planner's format; the paper does not mention any such replay.
+the planner's format, and exercises in text alone (`exercises`) keep what the base stage learnt from them; the paper does not
+mention any such replay.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos
 
 __all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Phase"]
 
-Kind = Literal["say", "do", "fill", "say_image", "body", "plan"]
+Kind = Literal["say", "do", "fill", "say_image", "body", "plan", "exercise"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +70,8 @@ class AlignmentData:
 
     def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> Batch:
         """A batch of one kind from the training rows."""
+        if kind == "exercise":
+            return self._collator([self.demos.exercise(rng) for _ in range(size)])
         if kind == "plan":
             rows = self.demos.draw(rng, size)
             return self._collator([self._plan(int(i), rng) for i in rows])
@@ -124,7 +127,7 @@ class AlignmentObjective:
         """A batch of one kind, drawn anew each step."""
         others: tuple[Kind, ...] = tuple(kind for kind in self._kinds if kind != "plan")
         if "plan" in self._kinds and rng.random() < self._cfg.plan_share:
-            kind: Kind = "plan"
+            kind: Kind = "exercise" if rng.random() < self._cfg.exercise_share else "plan"
         else:
             kind = others[int(rng.integers(len(others)))]
         return kind, self._data.batch(kind, rng, size)

@@ -48,7 +48,9 @@ def release_name(stage: str, variant: str) -> str:
 
 
 def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
-    """Copies every finished model of a pipeline's configuration to `folder/<model>/<name>`.
+    """Copies the base model and the variant's newest finished model to `folder/<model>/<name>`.
+
+    The model of stage `alignment` is copied only while `selu` has not finished.
 
     Args:
         pipeline: names folders and keys.
@@ -63,7 +65,8 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
     paths, written = pipeline.paths, []
     for stage in _MODELS:
         source, key = paths.model(stage), finished_key(paths.stage(stage))
-        if key is None or not source.is_dir():
+        superseded = stage == "alignment" and finished_key(paths.stage("selu")) is not None
+        if key is None or not source.is_dir() or superseded:
             continue
         target = Path(folder) / pipeline.cfg.model.name / release_name(stage, pipeline.cfg.variant)
         work = target.with_name(target.name + ".tmp")

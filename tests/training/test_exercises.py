@@ -27,7 +27,8 @@ def test_words_are_those_of_the_instructions() -> None:
 
 
 def test_names_change_everywhere_alike() -> None:
-    exchange = Exchange({"SoapBottle": "Mug", "Bottle": "SoapBottle", "Mug": "Bottle", "SideTable": "Desk", "Desk": "SideTable"})
+    small = {"SoapBottle": "Mug", "Bottle": "SoapBottle", "Mug": "Bottle"}
+    exchange = Exchange(small | {"SideTable": "Desk", "Desk": "SideTable"})
     row = exchange.row(ROW)
     assert row["instruction"] == (
         "Take the mug from the second desk and put the soap bottle next to the TV stand on the side table."

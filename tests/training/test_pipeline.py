@@ -187,7 +187,7 @@ def test_variants() -> None:
 
 def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written = release.export(trained, tmp_path)
-    assert [folder.name for folder in written] == ["base", "full-alignment", "full"]
+    assert [folder.name for folder in written] == ["base", "full"]
     about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
     assert list(about["stages"]) == ["base", "pointmap", "tokenizer", "alignment", "selu"]
     assert all(stage["command"] == "python train.py stage=all" and stage["metrics"] for stage in about["stages"].values())
