@@ -110,12 +110,13 @@ def main(arguments: Sequence[str]) -> int:
     except ConfigError as error:
         sys.stderr.write(f"train.py: {error}\n")
         return 2
+    from data.humanml3d import DatasetError
     from data.shards import ShardError
     from proprio_mllm.training.pipeline import StageError
 
     try:
         run(cfg)
-    except (ShardError, StageError) as error:
+    except (DatasetError, ShardError, StageError) as error:
         sys.stderr.write(f"train.py: {error}\n")
         return 1
     return 0

@@ -1,6 +1,6 @@
 """How well a robot follows a human clip: errors, contact, limits, smoothness, balance.
 
-Definitions follow `docs` and common practice: an error is the distance to the method's own targets (after scaling), limb
+Definitions follow common practice: an error is the distance to the method's own targets (after scaling), limb
 direction is scale-free and compares with the human, contact comes from the human's toes.
 Shape letters: T frames. Units: cm, degrees, percent of frames; radians for joints.
 

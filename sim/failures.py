@@ -7,7 +7,8 @@ the planner is to notice and recover.
 
 Margins are signed: `reach_m` is how far the target lies beyond the arm (positive: too far), `height_m` the change of pelvis
 height that would bring it into reach (negative: move down), `mass_kg` the mass above the limit, `travel_m` the distance that
-was covered before a path was blocked, `gap_m` the distance between the fingers and what they should have touched.
+was covered before a path was blocked, `gap_m` the distance between the fingers and what they should have touched (for
+`HandleSlipped` the share of the joint's range that is missing).
 """
 
 from __future__ import annotations
