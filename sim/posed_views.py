@@ -111,7 +111,7 @@ def draw_pose(world: World, free: Array, rng: np.random.Generator) -> Pose:
         arm = robot.arms[side]
         rest, carry = np.asarray(arm.rest), np.asarray(arm.carry)
         kind = rng.random()
-        ready = ready_posture(robot.name, Arm(side))
+        ready = ready_posture(robot_kit(robot), Arm(side))
         posture = ready if kind < 0.55 else rest + rng.random() * (carry - rest)
         if kind > 0.75:
             limits = np.array([world.model.joint(name).range for name in arm.joints])

@@ -167,7 +167,7 @@ class Session:
         self.close()
         joints: dict[str, float] = {}
         for arm in Arm:
-            posture = ready_posture(self.robot.name, arm)
+            posture = ready_posture(robot_kit(self.robot), arm)
             joints |= dict(zip(self.robot.arms[arm.value].joints, map(float, posture), strict=True))
         start, height = None, None
         if task.start is not None:

@@ -26,7 +26,7 @@ from sim.navigation import NavigationMap, Stance
 from sim.objects import ObjectInstance
 from sim.placement import OVERHANG_SHARE
 from sim.robots.arm_ik import PerArmSolver
-from sim.robots.build_solver import robot_kit
+from sim.robots.build_solver import RobotKit, robot_kit
 from sim.robots.solver import ReachTarget
 from sim.scene import BASE_JOINTS
 from sim.skills.clearance import ClearanceProbe
@@ -99,11 +99,12 @@ class Body:
             raise ValueError("skills need a world with a robot, got one without")
         self.spec = world.robot
         kit = robot_kit(self.spec)
+        self.kit = kit
         self.kinematics = kit.model
         self.crouches = kit.crouches
         self.whole_body = kit.solver
         self._per_arm = PerArmSolver(kit.model, kit.crouches)
-        self.maps: Mapping[str, ReachMap] = reach_maps(self.spec.name)
+        self.maps: Mapping[str, ReachMap] = reach_maps(kit)
         model = world.model
         self._actuators = {name: int(model.actuator(name).id) for name in self.spec.joints if _has_actuator(model, name)}
         self._base = [int(model.actuator(name).id) for name in BASE_JOINTS]  # x, y, z, yaw, pitch
@@ -367,7 +368,7 @@ class Body:
 
     def ready(self, arm: Arm) -> Array:
         """(A,) posture between actions: hand before the shoulder, fingers level, above tables and beside the camera's view."""
-        return ready_posture(self.spec.name, arm)
+        return ready_posture(self.kit, arm)
 
     def carrying(self, arm: Arm) -> Array:
         """(A,) posture in which a hand carries something: the ready one, or higher and closer on robots with low shoulders.
@@ -379,7 +380,7 @@ class Body:
             + float(self.maps[arm.value].shoulder[2])
             - _READY_DROP * self.maps[arm.value].reach_m
         )
-        return ready_posture(self.spec.name, arm, raised=ready_m < _WORKTOP_M)
+        return ready_posture(self.kit, arm, raised=ready_m < _WORKTOP_M)
 
     def solve(
         self,
@@ -498,7 +499,7 @@ class Body:
             reach_map = self.maps[arm.value]
             high = reach_map.shoulder + reach_map.reach_m * np.array([0.6, 0.0, -0.05])
             forward = reach_map.starts(HandPose(high, np.array([1.0, 0.0, 0.0])), 1, near=self.ready(arm))[0]
-            self._vias[arm] = (self.ready(arm), forward, ready_posture(self.spec.name, arm, raised=True))
+            self._vias[arm] = (self.ready(arm), forward, ready_posture(self.kit, arm, raised=True))
         return self._vias[arm]
 
     # ---- motions
@@ -583,9 +584,9 @@ class Body:
 
 
 @lru_cache(maxsize=8)
-def ready_posture(robot_name: str, arm: Arm, raised: bool = False) -> Array:
+def ready_posture(kit: RobotKit, arm: Arm, raised: bool = False) -> Array:
     """See `Body.ready` and `Body.carrying`; solved once per robot and arm."""
-    kit, reach_map = robot_kit(robot_name), reach_maps(robot_name)[arm.value]
+    reach_map = reach_maps(kit)[arm.value]
     inward = np.array([0.0, -1.0 if arm is Arm.LEFT else 1.0, 0.0])
     ahead = min(0.3 * reach_map.reach_m, kit.spec.footprint_radius_m - 0.06)  # the disc that navigation keeps free
     drop = -0.16 if raised else _READY_DROP
@@ -598,7 +599,7 @@ def ready_posture(robot_name: str, arm: Arm, raised: bool = False) -> Array:
     rotation = wish.rotation(wish.pointing, inward) if wish.pointing is not None else np.eye(3)
     height = kit.spec.standing_pelvis_height_m
     elbow = kit.spec.key_bodies[f"{arm.value}_elbow"]
-    tip_m = hand_shape(robot_name).tip_m
+    tip_m = hand_shape(kit.spec.name).tip_m
     best: tuple[float, Array] | None = None
     for start in reach_map.starts(wish, 60, radius_m=0.15, near=np.array(kit.spec.arms[arm.value].carry)):
         q = kit.model.posture()

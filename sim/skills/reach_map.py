@@ -19,8 +19,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from sim.robots.build_solver import RobotKit
 from sim.robots.kinematics import RobotModel
-from sim.robots.spec import load_robot
 
 __all__ = ["WOUND_RAD", "HandPose", "ReachMap", "reach_maps"]
 
@@ -125,9 +125,9 @@ class ReachMap:
 
 
 @lru_cache(maxsize=4)
-def reach_maps(robot_name: str) -> dict[str, ReachMap]:
+def reach_maps(kit: RobotKit) -> dict[str, ReachMap]:
     """The reach maps of a robot's `left` and `right` arm, waist straight."""
-    spec = load_robot(robot_name)
+    spec = kit.spec
     robot = RobotModel(spec)
     rng = np.random.default_rng(20)
     base = robot.configuration(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), robot.posture())

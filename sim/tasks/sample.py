@@ -257,7 +257,8 @@ def _hand_point(world: World, object_id: str, draft: Draft) -> NDArray[np.float6
 @functools.cache
 def _reach_limit_m(robot: str, level_cm: int) -> float:
     """Farthest horizontal distance from the pelvis at which some arm at some pelvis height reaches a level straight ahead."""
-    kit, maps = robot_kit(robot), reach_maps(robot)
+    kit = robot_kit(robot)
+    maps = reach_maps(kit)
     low, high = kit.spec.pelvis_height_range_m
     best = 0.0
     for height in np.linspace(low, high, 6):

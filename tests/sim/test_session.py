@@ -1,15 +1,19 @@
 """Sessions: observations, statistics, goals, exact snapshots, determinism."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
+import sim.robots
 from data.records import Action, Arm, PlanStep
 from sim.failures import FailureCode
 from sim.objects import ObjectPlacement
 from sim.session import FreePlay, Session
 from sim.tasks.predicates import Predicate
+from sim.tasks.task import load_benchmark
 
 MUG = ObjectPlacement("Mug_1", "CounterTop_1", (-1.15, 2.22))
 
@@ -128,3 +132,18 @@ def test_done_ends_the_episode(session):
         steps(session, "MoveBack(0.1)")
     with pytest.raises(RuntimeError, match="no episode"):
         Session("h1").step(PlanStep.parse("Done()"))
+
+
+def test_a_robot_described_elsewhere_acts(tmp_path: Path) -> None:
+    source = Path(sim.robots.__file__).parent / "specs" / "x1.yaml"
+    values = yaml.safe_load(source.read_text(encoding="utf-8"))
+    values |= {"name": "mine", "mjcf": str((source.parent / values["mjcf"]).resolve())}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
+    session = Session(str(tmp_path / "mine.yaml"), image_size=0)
+    try:
+        session.reset(load_benchmark()[9], seed=0)
+        assert session.robot.name == "mine"
+        assert session.act(PlanStep.parse("GoTo(StoveKnob_2)")).success
+        assert session.assess(PlanStep.parse("Pick(left, StoveKnob_2)").actions[0]) is not None
+    finally:
+        session.close()
