@@ -1,8 +1,9 @@
 """Gymnasium environment: plan steps as text in, images and proprioception out, reward when the goals hold.
 
 For users of reinforcement-learning tooling; the evaluation uses `sim.session` directly. The action is a plan step in the
-textual grammar of `data.records` (`Pick(left, Mug_1) & Open(right, Fridge_1)`). Text outside the grammar changes nothing and is
-reported in `info`. Paper: DualTHOR as an environment; the reward is ours (share of goal conditions that hold, 1 at success).
+textual grammar of `data.records` (`Pick(left, Mug_1) & Open(right, Fridge_1)`). Text outside the grammar changes nothing, costs
+a step and is reported in `info`. Paper: DualTHOR as an environment; the reward is ours (share of goal conditions that hold, 1 at
+success).
 """
 
 from __future__ import annotations
@@ -50,6 +51,7 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
         self._session = Session(robot, difficulty, image_size)
         self._tasks: tuple[TaskLike, ...] = tuple(tasks) or (FreePlay("kitchen_1", step_budget=50),)
         self._last: Observation | None = None
+        self._invalid = 0
         joints = len(self._session.robot.joints)
         big = np.float32(1e3)
         self.observation_space = spaces.Dict(
@@ -77,6 +79,7 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
         index = int((options or {}).get("task", self.np_random.integers(len(self._tasks))))
         if not 0 <= index < len(self._tasks):
             raise ValueError(f"task index {index} outside 0..{len(self._tasks) - 1}")
+        self._invalid = 0
         self._last = self._session.reset(self._tasks[index], int(self.np_random.integers(2**31)))
         return self._vector(self._last), self._info("")
 
@@ -87,13 +90,14 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
             plan_step = PlanStep.parse(str(action))
         except ActionError as problem:
             error = str(problem)
+            self._invalid += 1
         else:
             self._last, _ = self._session.step(plan_step)
         assert self._last is not None
         goals = self._session.goal_status()
         reward = float(np.mean(goals)) if goals else 0.0
         done = self._session.succeeded or self._session.ended
-        truncated = not done and self._session.stats.steps >= self._session.task.step_budget
+        truncated = not done and self._session.stats.steps + self._invalid >= self._session.task.step_budget
         return self._vector(self._last), reward, done, truncated, self._info(error)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]  # one render mode, one return type

@@ -12,7 +12,7 @@ from sim.session import FreePlay
 
 @pytest.fixture(scope="module")
 def env():
-    made = DualThorEnv("x1", tasks=(FreePlay("living_room_1", step_budget=2),), image_size=56, render_mode="rgb_array")
+    made = DualThorEnv("x1", tasks=(FreePlay("living_room_1", step_budget=3),), image_size=56, render_mode="rgb_array")
     yield made
     made.close()
 
@@ -50,3 +50,13 @@ def test_bad_arguments(env):
         env.reset(options={"task": 5})
     with pytest.raises(ValueError, match="unknown render_mode 'human'"):
         DualThorEnv(render_mode="human")
+
+
+def test_invalid_text_uses_up_the_budget():
+    env = DualThorEnv("x1", image_size=56)
+    env.reset(seed=0)
+    budget = env.session.task.step_budget
+    ends = [env.step("what?")[3] for _ in range(budget)]
+    assert not any(ends[:-1])
+    assert ends[-1]
+    env.close()
