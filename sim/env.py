@@ -2,8 +2,8 @@
 
 For users of reinforcement-learning tooling; the evaluation uses `sim.session` directly. The action is a plan step in the
 textual grammar of `data.records` (`Pick(left, Mug_1) & Open(right, Fridge_1)`). Text outside the grammar changes nothing, costs
-a step and is reported in `info`. Paper: DualTHOR as an environment; the reward is ours (share of goal conditions that hold, 1 at
-success).
+a step and is reported in `info`. Paper: DualTHOR as an environment; the reward is ours (share of goal conditions that hold, 1
+at success).
 """
 
 from __future__ import annotations
