@@ -201,6 +201,11 @@ def backbone_state(model: ProprioMLLM) -> dict[str, Tensor]:
     return state
 
 
+def _head_prefixes(cfg: ModelConfig) -> tuple[str, ...]:
+    """Parts that are stored in `heads.safetensors`; CUT3R's weights stay where the user has them, as their licence asks."""
+    return ("cse.", "mpe.") if cfg.point_map.encoder == "cut3r" else ("cse.", "mpe.", "point_map.")
+
+
 def save_model(model: ProprioMLLM, folder: str | Path, motion: MotionTokenizer | None = None) -> None:
     """Writes a model so that `load_model` gives the same one; the folder appears at once, complete.
 
@@ -215,9 +220,7 @@ def save_model(model: ProprioMLLM, folder: str | Path, motion: MotionTokenizer |
     work.mkdir(parents=True)
     model.processor.save_pretrained(str(work / "processor"))
     state = backbone_state(model)
-    # CUT3R's weights stay where the user has them: their licence does not let them travel with a model
-    kept = ("cse.", "mpe.") if model.cfg.point_map.encoder == "cut3r" else ("cse.", "mpe.", "point_map.")
-    heads = {k: v for k, v in model.state_dict().items() if k.startswith(kept)}
+    heads = {k: v for k, v in model.state_dict().items() if k.startswith(_head_prefixes(model.cfg))}
     if model.cfg.weights is None:
         (work / "vlm").mkdir()
         if model.core.config.tie_word_embeddings:
@@ -270,8 +273,7 @@ def load_model(folder: str | Path, adapter: str | None = None, trainable: bool =
     merger = {k.removeprefix("backbone."): v for k, v in heads.items() if k.startswith("backbone.")}
     model.core.load_state_dict(merger, strict=False)
     own = {k: v for k, v in heads.items() if not k.startswith("backbone.")}
-    elsewhere = ("vlm.", "point_map.") if cfg.point_map.encoder == "cut3r" else ("vlm.",)
-    missing = [k for k in model.load_state_dict(own, strict=False).missing_keys if not k.startswith(elsewhere)]
+    missing = [k for k in model.load_state_dict(own, strict=False).missing_keys if k.startswith(_head_prefixes(cfg))]
     if missing:
         raise ValueError(f"{folder}/heads.safetensors lacks {missing[:3]}")
     names: list[str] = stored["adapters"]
