@@ -1,7 +1,8 @@
 """Trains Proprio-MLLM: `python train.py stage=all model=tiny` (paper, three stages; `stage=base` stands in for pretraining).
 
-Stages: data (motions to clips shards), collect (views and demonstrations), base, pointmap, tokenizer, alignment, selu; `all`
-runs them in order and skips what is current. Options are documented in configs/schema/train.py.
+Stages: data (motions to clips shards), collect (views and demonstrations), base, corrections (the base model acts, the expert
+corrects it), pointmap, tokenizer, alignment, selu; `all` runs them in order and skips what is current. Options are documented
+in configs/schema/train.py.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from configs.validate import ConfigError, build
 
 logger = logging.getLogger("train")
 
-TRAINING_STAGES = ("base", "pointmap", "tokenizer", "alignment", "selu")
+TRAINING_STAGES = ("base", "corrections", "pointmap", "tokenizer", "alignment", "selu")
 
 
 def make_data(cfg: TrainConfig) -> None:
@@ -81,7 +82,7 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
     command = " ".join(["python train.py", *sys.argv[1:]])
-    pipeline = Pipeline(cfg, _rollouts, command)
+    pipeline = Pipeline(cfg, _rollouts, command, _corrections)
     metrics = {name: pipeline.run(name) for name in wanted}
     if cfg.release is not None:
         from proprio_mllm.training.release import export
@@ -98,6 +99,13 @@ def _rollouts(*args: Any, **kwargs: Any) -> Any:
     from proprio_mllm.evaluation.rollouts import collect_rollouts
 
     return collect_rollouts(*args, **kwargs)
+
+
+def _corrections(*args: Any, **kwargs: Any) -> Any:
+    """The base model acts in the simulator and the expert corrects it; training reads the shards."""
+    from proprio_mllm.evaluation.corrections import collect_corrections
+
+    return collect_corrections(*args, **kwargs)
 
 
 def main(arguments: Sequence[str]) -> int:

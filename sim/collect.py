@@ -32,7 +32,7 @@ __all__ = ["collect", "main", "parts_of", "rows_of_part"]
 _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.
-_VERSION = 2
+_VERSION = 3
 #: Fields that do not change what is written.
 _UNKEYED = {"views": ("out", "workers", "noise", "medium_share"), "demos": ("out", "workers", "views_per_world")}
 

@@ -4,13 +4,17 @@ With some probability a perturbed step is executed instead of the expert's, whil
 (as in DAgger), and some episodes run at medium difficulty; both lead into states that a learned planner will meet and that the
 expert alone would never visit. Episodes that do not end in success are dropped as a whole, so every recorded step led, or could
 have led, to the goal. Paper: planning demonstrations; what the paper takes from pretraining.
+
+With a student, its steps are executed in place of the expert's (DAgger, Ross et al. 2011): what is recorded is what the expert
+would do where a learned planner's own mistakes have led it. The student gets no say where it repeats a step that just failed or
+ends the episode, in a share of the steps, and after as many steps as the task allows; the expert then finishes the episode.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -23,13 +27,21 @@ from sim.session import Session
 from sim.tasks.sample import TRAIN_SEEDS, rng_for, sample_task
 from sim.tasks.task import Task
 
-__all__ = ["Episode", "demos_of_part", "perturbed", "run_episode"]
+__all__ = ["Episode", "Student", "corrections_of_part", "demos_of_part", "perturbed", "run_correction", "run_episode"]
+
+#: A planner that learns: the step it would take, None when its reply is no step.
+Student = Callable[[Observation], PlanStep | None]
 
 #: Training seeds of one collection seed; two collections do not share tasks.
 _SEEDS_PER_COLLECTION: Final = 1_000_000
 #: The expert gives an episode up when it has thought about this many stances: four fifths of the time went into episodes that
 #: failed in the end and were dropped.
 _REHEARSALS: Final = 6
+#: The same where a student leads the robot astray, and the steps that the expert has for finishing after it.
+_STUDENT_REHEARSALS: Final = 16
+_FINISH: Final = 10
+#: Episodes with a student take their tasks from here on, so that they share none with the expert's own.
+_STUDENT_FROM: Final = 500_000
 
 
 @dataclass(slots=True)
@@ -66,13 +78,7 @@ def run_episode(config: CollectConfig, index: int, sessions: dict[tuple[str, str
         sessions: sessions by (robot, difficulty), reused between episodes.
     """
     rng = rng_for("demos", config.seed, index)
-    robot = config.robots[index % len(config.robots)]
-    room = config.rooms[(index // len(config.robots)) % len(config.rooms)]
-    task = sample_task(TRAIN_SEEDS.start + config.seed * _SEEDS_PER_COLLECTION + index, room, robots=(robot,))
-    difficulty = "medium" if rng.random() < config.medium_share else "easy"
-    sessions = {} if sessions is None else sessions
-    session = sessions.setdefault((robot, difficulty), Session(robot, difficulty, config.image_size))
-    observation = session.reset(task, seed=task.seed)
+    robot, task, session, observation = _start(config, index, rng, {} if sessions is None else sessions)
     expert = Expert(session, rehearsals=_REHEARSALS)
     expert.reset()
     episode = Episode()
@@ -87,6 +93,75 @@ def run_episode(config: CollectConfig, index: int, sessions: dict[tuple[str, str
         observation, _ = session.step(step)
     episode.success, episode.steps = session.succeeded, len(episode.rows)
     return episode
+
+
+def corrections_of_part(config: CollectConfig, part: int, student: Student) -> Iterator[dict[str, Any]]:
+    """Rows of one part of a `demos` folder whose steps the student chose and the expert corrected."""
+    first = part * config.part_size
+    sessions: dict[tuple[str, str], Session] = {}
+    for index in range(first, min(first + config.part_size, config.count)):
+        episode = run_correction(config, index, student, sessions)
+        if episode.success:
+            yield from episode.rows
+
+
+def run_correction(
+    config: CollectConfig, index: int, student: Student, sessions: dict[tuple[str, str], Session] | None = None
+) -> Episode:
+    """Plays one episode in which a student acts and the expert names the step it would have taken.
+
+    Args:
+        config: the collection; `noise` is the share of steps that the expert takes itself.
+        index: number of the episode.
+        student: the learned planner.
+        sessions: sessions by (robot, difficulty), reused between episodes.
+    """
+    rng = rng_for("corrections", config.seed, index)
+    sessions = {} if sessions is None else sessions
+    robot, task, session, observation = _start(config, _STUDENT_FROM + index, rng, sessions, _FINISH)
+    expert = Expert(session, rehearsals=_STUDENT_REHEARSALS)
+    expert.reset()
+    episode = Episode()
+    while not session.finished:
+        target = expert.next_step()
+        step, origin = target, "expert"
+        if rng.random() >= config.noise and len(episode.rows) < task.step_budget - _FINISH:
+            proposed = student(observation)
+            if proposed is not None and proposed.actions[0].name != "Done" and not _repeats(proposed, observation):
+                step, origin = proposed, "student"
+        executed = {"executed": step.to_text(), "origin": origin}
+        episode.rows.append(_row(observation, task, robot, _STUDENT_FROM + index, target, executed))
+        if target.actions[0].name == "Done":
+            break
+        observation, _ = session.step(step)
+    episode.success, episode.steps = session.succeeded, len(episode.rows)
+    return episode
+
+
+def _repeats(step: PlanStep, observation: Observation) -> bool:
+    """Whether a step is the one that has just failed."""
+    if not observation.history:
+        return False
+    last = observation.history[-1]
+    worked = all(outcome.endswith(" ok") for outcome in last.feedback.split("; "))
+    return last.step == step.to_text() and not worked
+
+
+def _start(
+    config: CollectConfig,
+    index: int,
+    rng: np.random.Generator,
+    sessions: dict[tuple[str, str], Session],
+    extra_steps: int = 0,
+) -> tuple[str, Task, Session, Observation]:
+    """Opens the episode's task."""
+    robot = config.robots[index % len(config.robots)]
+    room = config.rooms[(index // len(config.robots)) % len(config.rooms)]
+    task = sample_task(TRAIN_SEEDS.start + config.seed * _SEEDS_PER_COLLECTION + index, room, robots=(robot,))
+    task = replace(task, step_budget=task.step_budget + extra_steps)
+    difficulty = "medium" if rng.random() < config.medium_share else "easy"
+    session = sessions.setdefault((robot, difficulty), Session(robot, difficulty, config.image_size))
+    return robot, task, session, session.reset(task, seed=task.seed)
 
 
 def perturbed(

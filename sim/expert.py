@@ -4,13 +4,14 @@ What comes next follows from goals and object states (`sim.tasks.jobs`); whether
 or higher the pelvis would have to be, from the simulator's own reach test (`Session.assess`), which moves nothing. The style is
 canonical on purpose, so that a small model can imitate it: GoTo, then MoveDown or MoveUp where the arm needs it, then the arm
 action, on both arms at once where both can reach. The expert re-plans from the current state at every step, so failures and
-perturbations need no special case. It is marked privileged in every table; learned planners never see what it sees.
+perturbations need no special case; when something else than its step was done, it forgets having proposed it, so that the same
+state gets the same step. It is marked privileged in every table; learned planners never see what it sees.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -73,6 +74,36 @@ class _Place:
         return gap < 0.03 and turn < 0.07 and abs(self.height_m - other.height_m) < 0.5 * HEIGHT_STEP_M
 
 
+@dataclass(frozen=True, slots=True)
+class _Refusal:
+    """An action that does not work from a place: `verdict` says why it cannot be reached, None that the physics decided."""
+
+    action: str
+    place: _Place
+    verdict: SkillFailure | None
+
+
+@dataclass(slots=True)
+class _Memory:
+    """What earlier attempts taught.
+
+    Attributes:
+        attempts: how often a way was tried.
+        refusals: what does not work from where.
+        gone: stances tried, by target.
+        rehearsed: stances tried in thought.
+    """
+
+    attempts: dict[str, int] = field(default_factory=dict)
+    refusals: list[_Refusal] = field(default_factory=list)
+    gone: dict[str, set[str]] = field(default_factory=dict)
+    rehearsed: int = 0
+
+    def copy(self) -> _Memory:
+        gone = {target: set(tried) for target, tried in self.gone.items()}
+        return _Memory(dict(self.attempts), list(self.refusals), gone, self.rehearsed)
+
+
 class Expert:
     """Plans one step at a time for a session.
 
@@ -92,22 +123,16 @@ class Expert:
         """
         self._session = session
         self._rehearsals = rehearsals
-        self._rehearsed = 0
-        self._attempts: dict[str, int] = {}
-        self._fruitless: list[tuple[str, _Place]] = []
+        self._memory, self._before = _Memory(), _Memory()
         self._homes: dict[str, str] = {}
-        self._gone: dict[str, set[str]] = {}
         self._proposed = ""
         self.intent: Action | None = None
         self._rehearsal = Rehearsal(session)
 
     def reset(self) -> None:
         """Forgets earlier attempts; call after the session's reset."""
-        self._attempts.clear()
-        self._fruitless.clear()
-        self._gone.clear()
+        self._memory, self._before = _Memory(), _Memory()
         self._proposed = ""
-        self._rehearsed = 0
         self._homes = {placement.object_id: placement.receptacle for placement in self._session.task.placements or ()}
 
     def facts(self) -> Facts:
@@ -147,13 +172,15 @@ class Expert:
         verdicts: list[SkillFailure] = []
         for arm in self._arms(head, facts):
             action = head.action(arm)
-            if self._failed_here(action):
-                continue
-            verdict = self._session.assess(action)
-            if verdict is None:
-                return self._with_companion(head, arm, jobs[1:], facts)
-            self._fruitless.append((action.to_text(), self._here()))
-            verdicts.append(verdict)
+            refusal = self._refused_here(action)
+            if refusal is None:
+                verdict = self._session.assess(action)
+                if verdict is None:
+                    return self._with_companion(head, arm, jobs[1:], facts)
+                refusal = _Refusal(action.to_text(), self._here(), verdict)
+                self._memory.refusals.append(refusal)
+            if refusal.verdict is not None:
+                verdicts.append(refusal.verdict)
         return _single(self._approach(head, verdicts, facts))
 
     # ---- memory
@@ -161,30 +188,34 @@ class Expert:
     def _here(self) -> _Place:
         return _Place(self._session.body.commanded_base(), self._session.body.pelvis_height_m)
 
-    def _failed_here(self, action: Action) -> bool:
+    def _refused_here(self, action: Action) -> _Refusal | None:
+        """Why an action does not work from here; what the physics decided weighs more than what was thought."""
         text, here = action.to_text(), self._here()
-        return any(text == other and here.near(there) for other, there in self._fruitless)
+        found = [refusal for refusal in self._memory.refusals if text == refusal.action and here.near(refusal.place)]
+        return next((refusal for refusal in found if refusal.verdict is None), found[0] if found else None)
 
     def _learn(self) -> None:
         """Remembers what failed in the physics from where; a success changes the scene and makes all of it moot."""
         if not self._session.history:
             return
-        if self._session.history[-1].step != self._proposed:  # something else was done: stances may be as good as new
-            self._attempts.clear()
-            self._gone.clear()
+        other = self._session.history[-1].step != self._proposed
+        if other:  # what was proposed was not done
+            self._memory = self._before.copy()
         for outcome in self._session.history[-1].feedback.split("; "):
             text, _, code = outcome.rpartition(" ")
             if code in _FRUITLESS:
-                self._fruitless.append((text, self._here()))
+                self._memory.refusals.append(_Refusal(text, self._here(), None))
             elif code == "ok" and not text.startswith(_MOVES):
-                self._attempts.clear()
-                self._fruitless.clear()
-                self._gone.clear()
+                self._memory = _Memory(rehearsed=self._memory.rehearsed)
+            elif code == "ok" and other:  # the robot was moved: every stance is as good as new
+                self._memory.attempts.clear()
+                self._memory.gone.clear()
+        self._before = self._memory.copy()
 
     def _count(self, what: str) -> int:
         """How often this has been tried before; counts one more."""
-        self._attempts[what] = self._attempts.get(what, 0) + 1
-        return self._attempts[what] - 1
+        self._memory.attempts[what] = self._memory.attempts.get(what, 0) + 1
+        return self._memory.attempts[what] - 1
 
     def _lost(self, job: Job, facts: Facts) -> bool:
         """Whether the job's object lies on the floor, where neither robot reaches, or is broken."""
@@ -222,7 +253,7 @@ class Expert:
                 if job.arm not in (None, other) or (job.arm is None and other not in facts.free_arms()):
                     continue
                 first, second = head.action(mine), job.action(other)
-                if any(self._failed_here(action) for action in (first, second)):
+                if any(self._refused_here(action) for action in (first, second)):
                     continue
                 if all(self._session.assess(action) is None for action in (second, first)):
                     return PlanStep((first, second))
@@ -236,7 +267,7 @@ class Expert:
         wrong = next((verdict for verdict in verdicts if verdict.code in _WRONG_HEIGHT), None)
         if wrong is not None and self._count(f"height {target}") < _HEIGHT_TRIALS:
             return self._height_change(wrong.margins["height_m"])
-        self._attempts.pop(f"height {target}", None)
+        self._memory.attempts.pop(f"height {target}", None)
         rise_m = self._rise_m(job)
         if rise_m > 0.02:
             return self._height_change(rise_m)
@@ -245,12 +276,12 @@ class Expert:
             return Action("Done")
         actions = [job.action(arm) for arm in self._arms(job, facts)]
         options = [Action("GoTo", object_id=target, amount=d, bearing_deg=b) for d, b in _STANCES]
-        tried = self._gone.setdefault(target, set())
+        tried = self._memory.gone.setdefault(target, set())
         fresh = [option for option in options if option.to_text() not in tried]
         for option in fresh[:_REHEARSED]:
-            if self._rehearsals is not None and self._rehearsed >= self._rehearsals:
+            if self._rehearsals is not None and self._memory.rehearsed >= self._rehearsals:
                 return Action("Done")
-            self._rehearsed += 1
+            self._memory.rehearsed += 1
             stance = self._rehearsal.stance_of(option)
             if stance is not None and self._rehearsal.works(actions, stance):
                 tried.add(option.to_text())

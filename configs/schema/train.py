@@ -12,6 +12,7 @@ __all__ = [
     "AlignmentConfig",
     "BaseConfig",
     "CollectConfig",
+    "CorrectionsConfig",
     "LoggerConfig",
     "LoopConfig",
     "SeluConfig",
@@ -20,8 +21,8 @@ __all__ = [
     "Variant",
 ]
 
-StageName = Literal["all", "data", "collect", "base", "pointmap", "tokenizer", "alignment", "selu"]
-Variant = Literal["full", "no_mpe", "no_cse", "no_mpe_cse"]
+StageName = Literal["all", "data", "collect", "base", "corrections", "pointmap", "tokenizer", "alignment", "selu"]
+Variant = Literal["full", "no_mpe", "no_cse", "no_mpe_cse", "no_proprio"]
 
 
 def _require(condition: bool, message: str) -> None:
@@ -159,6 +160,26 @@ class CollectConfig:
 
 
 @dataclass(frozen=True)
+class CorrectionsConfig:
+    """`stage=corrections`: the base model acts on training tasks, the expert names the right step in every state.
+
+    Attributes:
+        episodes: episodes; those that do not end in success are dropped. 0 goes on without corrections.
+        expert_share: share of the steps that the expert takes itself, so that episodes get somewhere.
+        workers: processes.
+    """
+
+    episodes: int = 0
+    expert_share: float = 0.25
+    workers: int = 2
+
+    def __post_init__(self) -> None:
+        _require(self.episodes >= 0, f"episodes {self.episodes} must not be negative")
+        _require(self.workers > 0, f"workers {self.workers} must be positive")
+        _require(0.0 <= self.expert_share <= 1.0, f"expert_share {self.expert_share} outside [0, 1]")
+
+
+@dataclass(frozen=True)
 class LoggerConfig:
     """Where metrics go besides the CSV file and the terminal.
 
@@ -177,7 +198,8 @@ class TrainConfig:
 
     Attributes:
         stage: what to run.
-        variant: which ablation of the model.
+        variant: which ablation of the model. `no_proprio` trains on the same data without motion tokens, MPE and CSE: what the
+            stages bring without proprioception.
         model: the model.
         output: folder of all outputs.
         seed: seed of data order, initial weights and rollouts.
@@ -186,6 +208,8 @@ class TrainConfig:
         release: folder the finished stages are exported to, None for no export.
         resume: continue an interrupted stage from its checkpoint.
         data: where motions come from, and what is kept of them.
+        collect: what the simulator writes before training.
+        corrections: what it writes with the base model at the controls.
     """
 
     stage: StageName
@@ -198,6 +222,7 @@ class TrainConfig:
     selu: SeluConfig
     data: DataConfig = field(default_factory=DataConfig)
     collect: CollectConfig = field(default_factory=CollectConfig)
+    corrections: CorrectionsConfig = field(default_factory=CorrectionsConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     output: str = "outputs"
     seed: int = 0

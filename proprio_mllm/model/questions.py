@@ -34,12 +34,13 @@ USABLE, STANDOFF = 0.95, 0.6
 #: Body shifts are rounded to this, metres.
 STEP_M = 0.1
 
+#: Terse questions about the body use words that planning has taught: the base stage does not ask them.
 QUESTIONS: Mapping[str, Mapping[Style, str]] = {
     "side": {"terse": "side {}", "full": "Is {} to the left, ahead or to the right?"},
     "distance": {"terse": "distance {}", "full": "Is {} near, middle or far?"},
     "height": {"terse": "height {}", "full": "Is {} low, level or high relative to your pelvis?"},
-    "arm": {"terse": "arm {}", "full": "Which arm reaches {} better: left, right or either?"},
-    "shift": {"terse": "shift {}", "full": "How must your body height change to reach {}? Give MoveDown, MoveUp or none."},
+    "arm": {"terse": "Pick {}", "full": "Which arm reaches {} better: left, right or either?"},
+    "shift": {"terse": "MoveDown {}", "full": "How must your body height change to reach {}? Give MoveDown, MoveUp or none."},
 }
 
 

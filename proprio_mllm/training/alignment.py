@@ -10,7 +10,9 @@
 pairs train. Besides clip captions, motion and image to text holds questions about the robot's own body in its scene (which arm
 reaches an object, how far the body must go down). A share of planning demonstrations, with motion tokens in the prompt, keeps
 the planner's format, and exercises in text alone (`exercises`) keep what the base stage learnt from them; the paper does not
-mention any such replay.
+mention any such replay. Corrections (`stage=corrections`) count as demonstrations here.
+
+The control `variant=no_proprio` has the joint phase alone, and of its pairs those that need no motion.
 """
 
 from __future__ import annotations
@@ -61,7 +63,8 @@ class AlignmentData:
         self.tokenizer, self.clips, self.views, self.demos = tokenizer, clips, views, demos
         self._cfg, self._collator = cfg, Collator(model.processor, model.cfg)
         self._style: Style = model.cfg.prompt
-        self._demo_tokens = demos.tokens(tokenizer)
+        self._proprioception = model.cfg.proprioception
+        self._demo_tokens = demos.tokens(tokenizer) if self._proprioception else None
         with_images = [i for i, images in enumerate(clips.reader.column("image_frames")) if images]
         self._pictured = np.intersect1d(np.asarray(with_images, dtype=np.int64), clips.split.train)
 
@@ -87,7 +90,7 @@ class AlignmentData:
     def _plan(self, index: int, rng: np.random.Generator) -> Example:
         if rng.random() < self._cfg.judge_share:
             return judge_example(self.demos, index, rng, self._demo_tokens)
-        return self.demos.example(index, self._demo_tokens[index].tolist())
+        return self.demos.example(index, None if self._demo_tokens is None else self._demo_tokens[index].tolist())
 
     def _motion_text(self, kind: Kind, clip: int, codes: Sequence[int], rng: np.random.Generator) -> Example:
         caption = self.clips.caption(clip, rng)
@@ -108,7 +111,7 @@ class AlignmentData:
         half = self._cfg.questions // 2
         pairs = self.views.pairs(row, BODY_RELATIVE, self._cfg.questions - half, rng)
         pairs += self.views.pairs(row, GROUNDING, half, rng)
-        codes = self.tokenizer.encode_window(row.motion)
+        codes = self.tokenizer.encode_window(row.motion) if self._proprioception else None
         return Example(looking(pairs or [self.views.listing(row)], codes, self._style), (row.view,))
 
 
@@ -121,7 +124,9 @@ class AlignmentObjective:
         self.name = f"alignment/{phase}"
         self.module: nn.Module = model
         self.key = key
-        self._data, self._cfg, self._kinds = data, cfg, PHASES[phase].kinds
+        kinds = PHASES[phase].kinds
+        self._data, self._cfg = data, cfg
+        self._kinds: tuple[Kind, ...] = kinds if model.cfg.proprioception else ("body", "plan")
 
     def batch(self, rng: np.random.Generator, size: int) -> tuple[Kind, Batch]:
         """A batch of one kind, drawn anew each step."""

@@ -1,7 +1,7 @@
 """Where stages keep their outputs, and when an output is current.
 
-    <output>/<model>/data/{clips,views,demos}      shards, shared by all variants
-    <output>/<model>/shared/{text,base,pointmap,tokenizer}
+    <output>/<model>/data/{clips,views,demos,corrections}   shards, shared by all variants
+    <output>/<model>/shared/{base,corrections,pointmap,tokenizer}
     <output>/<model>/<variant>/{alignment,selu}
 
 A finished stage writes `done.json` with its key (hash of configuration and inputs) and its metrics; the stage is current while
@@ -22,7 +22,7 @@ from data.shards import config_hash
 
 __all__ = ["StagePaths", "finish", "finished_key", "stage_key"]
 
-_SHARED = ("text", "base", "pointmap", "tokenizer")
+_SHARED = ("base", "corrections", "pointmap", "tokenizer")
 
 
 class StagePaths:
@@ -33,7 +33,7 @@ class StagePaths:
         self.variant = cfg.variant
 
     def shards(self, kind: str) -> Path:
-        """Folder of the `clips`, `views` or `demos` shards."""
+        """Folder of the `clips`, `views`, `demos` or `corrections` shards."""
         return self.root / "data" / kind
 
     def stage(self, name: str) -> Path:

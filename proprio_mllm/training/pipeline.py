@@ -1,24 +1,25 @@
 """Runs the training stages in order, each skipped while its output is current.
 
-base needs views, demos and clips (for the tokenizer's text); pointmap needs views; tokenizer needs clips and the windows of
-views and demos; alignment needs base, pointmap and tokenizer; selu needs alignment. The variants of the ablation share
-everything up to alignment and then train with the same budget.
+base needs views, demos and clips (for the tokenizer's text); corrections need base; pointmap needs views; tokenizer needs clips
+and the windows of views and demos; alignment needs base, corrections, pointmap and tokenizer; selu needs alignment. The
+variants of the ablation share everything up to alignment and then train with the same budget.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import logging
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import numpy as np
 
 from configs.schema.model import ModelConfig
-from configs.schema.train import LoopConfig, TrainConfig
-from data.shards import ShardReader, decode_motion
+from configs.schema.train import LoopConfig, TrainConfig, Variant
+from data.shards import ShardReader, config_hash, decode_motion
 from proprio_mllm.model.building import add_adapter, build_model, build_point_map, build_processor, load_model, save_model
 from proprio_mllm.model.dense import DenseHead
 from proprio_mllm.model.groups import train_only
@@ -31,6 +32,7 @@ from proprio_mllm.training.loop import Objective, run_loop
 from proprio_mllm.training.metrics import MetricWriter
 from proprio_mllm.training.motion_stage import MotionObjective, MotionWindows, tokenizer_metrics
 from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_key
+from proprio_mllm.training.rollouts import CorrectionRequest
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views, shard_hash
 from proprio_mllm.training.text import corpus, whole_words
 
@@ -41,7 +43,11 @@ logger = logging.getLogger(__name__)
 Metrics = dict[str, float]
 
 #: Stages whose current output a stage starts from.
-NEEDS: Final[Mapping[str, tuple[str, ...]]] = {"alignment": ("base", "pointmap", "tokenizer"), "selu": ("alignment",)}
+NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
+    "corrections": ("base",),
+    "alignment": ("base", "corrections", "pointmap", "tokenizer"),
+    "selu": ("alignment",),
+}
 
 
 class StageError(RuntimeError):
@@ -54,16 +60,17 @@ def variant_model(model: ModelConfig, variant: str) -> ModelConfig:
     Raises:
         ValueError: on an unknown variant.
     """
-    if variant not in ("full", "no_mpe", "no_cse", "no_mpe_cse"):
-        raise ValueError(f"variant {variant!r}; allowed: full, no_mpe, no_cse, no_mpe_cse")
-    mpe = dataclasses.replace(model.mpe, mode="mrope") if "mpe" in variant else model.mpe
-    cse = dataclasses.replace(model.cse, enabled=False) if "cse" in variant else model.cse
-    return dataclasses.replace(model, mpe=mpe, cse=cse)
+    if variant not in get_args(Variant):
+        raise ValueError(f"variant {variant!r}; allowed: {', '.join(get_args(Variant))}")
+    none = variant == "no_proprio"
+    mpe = dataclasses.replace(model.mpe, mode="mrope") if none or "mpe" in variant else model.mpe
+    cse = dataclasses.replace(model.cse, enabled=False) if none or "cse" in variant else model.cse
+    return dataclasses.replace(model, mpe=mpe, cse=cse, proprioception=model.proprioception and not none)
 
 
 def base_model_config(model: ModelConfig) -> ModelConfig:
     """The plain backbone: no MPE, no CSE, no proprioception."""
-    return dataclasses.replace(variant_model(model, "no_mpe_cse"), proprioception=False)
+    return variant_model(model, "no_proprio")
 
 
 class Pipeline:
@@ -74,13 +81,20 @@ class Pipeline:
         collect_rollouts: runs an actor in the simulator and writes `rollouts` shards; given by the entry point, because
             training does not know the simulator.
         command: the command line, stored with every finished stage.
+        collect_corrections: lets a model act in the simulator and writes the expert's corrections; given likewise.
     """
 
-    def __init__(self, cfg: TrainConfig, collect_rollouts: Callable[..., Any] | None = None, command: str = "") -> None:
+    def __init__(
+        self,
+        cfg: TrainConfig,
+        collect_rollouts: Callable[..., Any] | None = None,
+        command: str = "",
+        collect_corrections: Callable[..., Any] | None = None,
+    ) -> None:
         self.cfg = cfg
         self.command = command
         self.paths = StagePaths(cfg)
-        self._collect = collect_rollouts
+        self._collect, self._correct = collect_rollouts, collect_corrections
         self._taken: Metrics = {}  # steps of each run of the current stage: a time budget may end it early
 
     # ---- what a stage depends on --------------------------------------------------------------------------------------------
@@ -92,6 +106,9 @@ class Pipeline:
         if name == "base":
             inputs = {kind: shard_hash(shards(kind)) for kind in ("views", "demos", "clips")}
             return stage_key({"base": dataclasses.asdict(cfg.base), "model": plain}, cfg.seed, inputs)
+        if name == "corrections":
+            wanted = {"episodes": cfg.corrections.episodes, "expert_share": cfg.corrections.expert_share}
+            return stage_key(wanted, cfg.seed, {"base": self.key("base")})
         if name == "pointmap":
             wanted = {"loop": dataclasses.asdict(cfg.pointmap), "map": dataclasses.asdict(cfg.model.point_map)}
             return stage_key(wanted, cfg.seed, {"views": shard_hash(shards("views"))})
@@ -101,7 +118,7 @@ class Pipeline:
             return stage_key(wanted, cfg.seed, inputs)
         model = dataclasses.asdict(variant_model(cfg.model, cfg.variant))
         if name == "alignment":
-            inputs = {stage: self.key(stage) for stage in ("base", "pointmap", "tokenizer")}
+            inputs = {stage: self.key(stage) for stage in NEEDS["alignment"]}
             return stage_key({"alignment": dataclasses.asdict(cfg.alignment), "model": model}, cfg.seed, inputs)
         if name == "selu":
             return stage_key({"selu": dataclasses.asdict(cfg.selu)}, cfg.seed, {"alignment": self.key("alignment")})
@@ -135,6 +152,18 @@ class Pipeline:
         finally:
             writer.close()
 
+    def demos(self, model: ModelConfig) -> Demos:
+        """Demonstrations, and the corrections after them where there are any."""
+        folders = [self.paths.shards("demos")]
+        if self.corrected:
+            folders.append(self.paths.shards("corrections"))
+        return Demos(folders[0], model, folders[1:])
+
+    @property
+    def corrected(self) -> bool:
+        """Whether this configuration has corrections: there must be a base model of its own to correct."""
+        return self.cfg.corrections.episodes > 0 and self.cfg.model.weights is None
+
     # ---- stages -------------------------------------------------------------------------------------------------------------
 
     def _base(self, folder: Path, key: str) -> Metrics:
@@ -155,6 +184,31 @@ class Pipeline:
         self.loop(joint, cfg.base.joint, folder / "joint")
         save_model(model.eval(), self.paths.model("base"))
         return {**grounding_accuracy(model, views), **plan_accuracy(model, demos)}
+
+    def _corrections(self, folder: Path, key: str) -> Metrics:
+        cfg = self.cfg.corrections
+        if not self.corrected:
+            logger.info("corrections: none asked for, or no base model of this project's own")
+            return {}
+        if self._correct is None:
+            raise ValueError("stage 'corrections' needs the simulator: no collector was given")
+        shards = self.paths.shards("corrections")
+        size = self.cfg.model.image_size
+        request = CorrectionRequest(
+            self.paths.model("base"), shards, cfg.episodes, self.cfg.seed, cfg.expert_share, size, config_hash({"key": key})
+        )
+        self._correct(request, workers=cfg.workers)
+        reader = ShardReader(shards, "demos")
+        notes = [json.loads(text) for text in reader.column("privileged")]
+        acted = zip(notes, reader.column("target"), strict=True)
+        own = [note["executed"] == target for note, target in acted if note["origin"] == "student"]
+        return {
+            "episodes": float(cfg.episodes),
+            "kept_episodes": float(len(set(reader.column("episode")))),
+            "steps": float(len(notes)),
+            "student_steps": float(len(own)),
+            "student_as_expert": float(np.mean(own)) if own else 0.0,
+        }
 
     def _train_dense(self, objective: DenseObjective, model: ProprioMLLM, head: DenseHead, folder: Path) -> None:
         chosen = {id(p) for p in train_only(model, ("vision", "merger", "rows"))} | {id(p) for p in head.parameters()}
@@ -207,15 +261,18 @@ class Pipeline:
     def _alignment(self, folder: Path, key: str) -> Metrics:
         model = self._start_alignment()
         tokenizer = MotionTokenizer.load(self.paths.model("tokenizer"))
-        views, demos = Views(self.paths.shards("views"), model.cfg), Demos(self.paths.shards("demos"), model.cfg)
+        views, demos = Views(self.paths.shards("views"), model.cfg), self.demos(model.cfg)
         data = AlignmentData(model, tokenizer, Clips(self.paths.shards("clips")), views, demos, self.cfg.alignment)
-        loops = {phase: getattr(self.cfg.alignment, phase) for phase in PHASES}
+        # without proprioception there is nothing to align apart
+        wanted = PHASES if model.cfg.proprioception else ("joint",)
+        loops = {phase: getattr(self.cfg.alignment, phase) for phase in wanted}
         for phase, loop in loops.items():
             train_only(model, PHASES[phase].groups)
             self.loop(AlignmentObjective(model, data, phase, self.cfg.alignment, f"{key}/{phase}"), loop, folder / phase)
-        save_model(model.eval(), self.paths.model("alignment"), tokenizer)
-        asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=tokenizer)
-        return {**asked, **plan_accuracy(model, demos, tokenizer)}
+        read = tokenizer if model.cfg.proprioception else None
+        save_model(model.eval(), self.paths.model("alignment"), read)
+        asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
+        return {**asked, **plan_accuracy(model, demos, read)}
 
     def _selu(self, folder: Path, key: str) -> Metrics:
         from proprio_mllm.training.selu import run_selu
@@ -241,6 +298,7 @@ def _load_trained(module: Any, path: Path) -> None:
 
 STAGES: Final[Mapping[str, Callable[[Pipeline, Path, str], Metrics]]] = {
     "base": Pipeline._base,
+    "corrections": Pipeline._corrections,
     "pointmap": Pipeline._pointmap,
     "tokenizer": Pipeline._tokenizer,
     "alignment": Pipeline._alignment,

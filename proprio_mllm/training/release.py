@@ -37,8 +37,8 @@ _MODELS: Final = ("base", "alignment", "selu")
 #: Stages that go into each released model, in order.
 _CHAIN: Final = {
     "base": ("base",),
-    "alignment": ("base", "pointmap", "tokenizer", "alignment"),
-    "selu": ("base", "pointmap", "tokenizer", "alignment", "selu"),
+    "alignment": ("base", "corrections", "pointmap", "tokenizer", "alignment"),
+    "selu": ("base", "corrections", "pointmap", "tokenizer", "alignment", "selu"),
 }
 
 
@@ -99,7 +99,7 @@ def _shrink(folder: Path) -> None:
 
 def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
     shards = {}
-    for kind in ("clips", "views", "demos"):
+    for kind in ("clips", "views", "demos", "corrections"):
         folder = pipeline.paths.shards(kind)
         if (folder / "manifest.json").is_file():
             shards[kind] = shard_hash(folder)

@@ -25,7 +25,7 @@ from data.records import Camera, HistoryItem, Observation
 from data.shards import ShardReader, decode_motion, decode_png, encode_png
 from proprio_mllm.model.batch import View
 
-__all__ = ["Moment", "Rollout", "RolloutCollector", "RolloutRequest", "read_rollouts", "rollout_row"]
+__all__ = ["CorrectionRequest", "Moment", "Rollout", "RolloutCollector", "RolloutRequest", "read_rollouts", "rollout_row"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +46,29 @@ class RolloutRequest:
     episodes: int
     seed: int
     temperature: float
+    config_hash: str
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionRequest:
+    """What is asked of whoever lets a model act and has the expert correct it.
+
+    Attributes:
+        model: folder of the model that acts.
+        folder: shard folder to write, kind `demos`.
+        episodes: number of episodes; those that do not end in success are dropped.
+        seed: of tasks and draws.
+        expert_share: share of the steps that the expert takes itself.
+        image_size: side of the pictures, pixels.
+        config_hash: hash to store in the shard's manifest.
+    """
+
+    model: Path
+    folder: Path
+    episodes: int
+    seed: int
+    expert_share: float
+    image_size: int
     config_hash: str
 
 

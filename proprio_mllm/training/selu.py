@@ -40,7 +40,6 @@ from proprio_mllm.training.goals import Relabel
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
-from proprio_mllm.training.sources import Demos
 
 if TYPE_CHECKING:
     from proprio_mllm.training.pipeline import Pipeline
@@ -135,7 +134,7 @@ class _Selu:
         self.pipeline, self.cfg, self.folder, self.key, self.collect = pipeline, pipeline.cfg.selu, folder, key, collect
         self.start = pipeline.paths.model("alignment")
 
-    def load(self, folder: Path, demos_folder: Path) -> None:
+    def load(self, folder: Path) -> None:
         """Loads a model with both adapters; the critic is made when it is missing."""
         self.model = load_model(folder, trainable=True)
         self.tokenizer = MotionTokenizer.load(folder / "motion") if self.model.cfg.proprioception else None
@@ -144,7 +143,7 @@ class _Selu:
             add_adapter(self.model, CRITIC)
             copy_adapter(self.model, ACTOR, CRITIC)
         self.collator = Collator(self.model.processor, self.model.cfg)
-        self.demos = Demos(demos_folder, self.model.cfg)
+        self.demos = self.pipeline.demos(self.model.cfg)
         self._tokens = None if self.tokenizer is None else self.demos.tokens(self.tokenizer)
 
     def _codes(self, index: int) -> list[int] | None:
@@ -178,7 +177,7 @@ class _Selu:
             before, folder / "rollouts", self.cfg.episodes, seed, self.cfg.temperature, config_hash({"key": key})
         )
         self.collect(request)
-        self.load(before, self.pipeline.paths.shards("demos"))
+        self.load(before)
         if number == 0:
             self.tune(CRITIC, "selu/practice", [], self.cfg.critic, 1.0, folder / "practice")
         style, last = self.model.cfg.prompt, self.model.cfg.history

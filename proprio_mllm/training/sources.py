@@ -147,11 +147,36 @@ class Views:
         return "see?", answers([str(thing["id"]) for thing in ordered][:8])
 
 
-class Demos:
-    """Expert steps: the planner's prompt and the step that the expert chose."""
+class _Joined:
+    """Several `demos` folders read as one, in order."""
 
-    def __init__(self, folder: Path, cfg: ModelConfig) -> None:
-        self.reader = ShardReader(folder, "demos")
+    def __init__(self, folders: Sequence[Path]) -> None:
+        self._readers = [ShardReader(folder, "demos") for folder in folders]
+        self._starts = np.cumsum([0, *(len(reader) for reader in self._readers)])
+
+    def column(self, name: str) -> list[Any]:
+        return [value for reader in self._readers for value in reader.column(name)]
+
+    def folder_of(self) -> list[int]:
+        """Number of the folder that each row comes from."""
+        return [number for number, reader in enumerate(self._readers) for _ in range(len(reader))]
+
+    def __getitem__(self, index: int) -> Mapping[str, Any]:
+        which = int(np.searchsorted(self._starts, index, side="right")) - 1
+        return self._readers[which][int(index - self._starts[which])]
+
+
+class Demos:
+    """Expert steps: the planner's prompt and the step that the expert chose.
+
+    Args:
+        folder: demonstrations.
+        cfg: the model's.
+        more: further folders of the same kind (corrections); their rows follow.
+    """
+
+    def __init__(self, folder: Path, cfg: ModelConfig, more: Sequence[Path] = ()) -> None:
+        self.reader = _Joined([folder, *more])
         self.split = _Split(self.reader.column("episode"), folder)
         self.motions = np.stack([decode_motion(m) for m in self.reader.column("motion")])  # (N, T, F)
         last: dict[str, tuple[int, int]] = {}
@@ -161,16 +186,16 @@ class Demos:
         self.finals = np.intersect1d([index for _, index in last.values()], self.split.train)
         self.style: Style = cfg.prompt
         self._cfg = cfg
-        categories = np.asarray(self.reader.column("category"))[self.split.train]
-        self._by_category = [self.split.train[categories == name] for name in sorted(set(categories))]
-
+        labels = np.char.add(np.asarray(self.reader.column("category")), np.asarray(self.reader.folder_of(), dtype=str))
+        labels = labels[self.split.train]
+        self._groups = [self.split.train[labels == name] for name in sorted(set(labels))]
         targets = self.reader.column("target")
         self._symbolic = np.array([i for i in self.split.train if is_symbolic(targets[int(i)])], dtype=np.int64)
 
     def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
-        """Training rows (size,), every category as often: the expert's successes are fewer where tasks are harder."""
-        chosen = rng.integers(len(self._by_category), size=size)
-        return np.array([rng.choice(self._by_category[c]) for c in chosen], dtype=np.int64)
+        """Training rows (size,), every category of every folder as often: there are fewer successes where tasks are harder."""
+        chosen = rng.integers(len(self._groups), size=size)
+        return np.array([rng.choice(self._groups[c]) for c in chosen], dtype=np.int64)
 
     def tokens(self, tokenizer: MotionTokenizer) -> NDArray[np.int64]:
         """Motion tokens (N, T / stride) of every row's window."""

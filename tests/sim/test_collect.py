@@ -11,7 +11,7 @@ from data.motion import N_FEATURES
 from data.records import Action, Arm, PlanStep
 from data.shards import ShardReader, decode_depth, decode_png, decode_segmentation
 from sim.collect import collect, main, parse, parts_of, rows_of_part
-from sim.demonstrations import perturbed, run_episode
+from sim.demonstrations import perturbed, run_correction, run_episode
 from sim.posed_views import type_names
 
 VIEWS = CollectConfig("views", "unused", 6, part_size=3, views_per_world=3, image_size=56)
@@ -91,6 +91,26 @@ def test_an_episode_has_one_row_per_step_with_the_experts_choice():
         executed = json.loads(row["privileged"])
         if number + 1 < len(episode.rows):
             assert episode.rows[number + 1]["history"][-1]["step"] == executed["executed"]
+
+
+def test_a_students_mistakes_are_recorded_with_the_experts_step():
+    config = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, medium_share=0.0)
+
+    def student(observation):
+        return PlanStep((Action("Place", arm=Arm.RIGHT, object_id=observation.known_objects[0]),))
+
+    episode = run_correction(config, 10, student)
+    again = run_correction(config, 10, student)
+    for name in ("target", "image", "history", "privileged"):
+        assert [row[name] for row in episode.rows] == [row[name] for row in again.rows]
+    assert episode.success
+    notes = [json.loads(row["privileged"]) for row in episode.rows]
+    assert notes[0]["origin"] == "student"
+    assert "HandEmpty" in episode.rows[1]["history"][0]["feedback"]
+    assert {row["target"] for row in episode.rows} <= {note["executed"] for note in notes if note["origin"] == "expert"}
+    # a step that has just failed is not tried again: the expert takes over
+    assert [note["origin"] for note in notes[:2]] == ["student", "expert"]
+    assert run_correction(config, 10, lambda observation: None).rows[-1]["target"] == episode.rows[-1]["target"]
 
 
 class _Seen:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +17,15 @@ from configs.schema.model import ModelConfig
 from configs.schema.train import TrainConfig
 from configs.validate import ConfigError, build
 from data.records import Camera, Observation, Proprioception
-from data.shards import ShardError, ShardWriter
+from data.shards import ShardError, ShardReader, ShardWriter
 from proprio_mllm.model.building import add_adapter, load_model
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.training import release
 from proprio_mllm.training.alignment import PHASES, AlignmentObjective
-from proprio_mllm.training.pipeline import Pipeline, StageError, variant_model
-from proprio_mllm.training.rollouts import RolloutRequest, read_rollouts, rollout_row
+from proprio_mllm.training.pipeline import STAGES, Pipeline, StageError, variant_model
+from proprio_mllm.training.rollouts import CorrectionRequest, RolloutRequest, read_rollouts, rollout_row
 from proprio_mllm.training.selu import CRITIC, copy_adapter, train_adapter
-from proprio_mllm.training.sources import shard_hash
+from proprio_mllm.training.sources import Demos, shard_hash
 
 HELPERS = importlib.util.spec_from_file_location("training_helpers", Path(__file__).with_name("conftest.py"))
 assert HELPERS is not None
@@ -62,6 +63,21 @@ def collect(request: RolloutRequest) -> None:
     writer.finish({})
 
 
+def correct(request: CorrectionRequest, workers: int) -> None:
+    """Scripted corrections in place of the simulator: a student that is right on every second of its steps."""
+    assert workers > 0
+    source = ShardReader(request.folder.parent / "demos", "demos")
+    rows = []
+    for number in range(12):
+        row = dict(source[number])
+        executed = row["target"] if number % 2 else "MoveAhead(0.5)"
+        note = {"executed": executed, "origin": "student" if number < 8 else "expert"}
+        rows.append({**row, "episode": f"corrected{number // 3}", "privileged": json.dumps(note)})
+    writer = ShardWriter(request.folder, "demos", request.config_hash, overwrite=True)
+    writer.write(0, rows)
+    writer.finish({})
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
     """Every stage, run once."""
@@ -70,9 +86,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
     cfg = build(TrainConfig, compose("train", ["budget=debug", f"output={root}", "logger.wandb=disabled", "selu.truth=oracle"]))
     small = dataclasses.replace(cfg, model=_small(cfg.model))
     (root / "tiny").mkdir()
-    (root / "tiny" / "data").symlink_to(shards, target_is_directory=True)
-    pipeline = Pipeline(small, collect, "python train.py stage=all")
-    for stage in ("base", "pointmap", "tokenizer", "alignment", "selu"):
+    shutil.copytree(shards, root / "tiny" / "data")
+    pipeline = Pipeline(small, collect, "python train.py stage=all", correct)
+    for stage in STAGES:
         assert pipeline.run(stage) is not None
     return pipeline
 
@@ -96,6 +112,10 @@ def test_current_stages_are_skipped_and_others_are_not(trained: Pipeline) -> Non
     assert changed.key("base") == trained.key("base")
     assert changed.key("pointmap") != trained.key("pointmap")
     assert changed.key("alignment") != trained.key("alignment")
+    more = dataclasses.replace(trained.cfg.corrections, episodes=5)
+    corrected = Pipeline(dataclasses.replace(trained.cfg, corrections=more), collect)
+    assert corrected.key("base") == trained.key("base")
+    assert corrected.key("alignment") != trained.key("alignment")
 
 
 def test_a_stage_names_what_it_needs(trained: Pipeline, tmp_path: Path) -> None:
@@ -116,9 +136,36 @@ def test_metrics_are_reported(trained: Pipeline) -> None:
         return json.loads((trained.paths.stage(stage) / "done.json").read_text())["metrics"]
 
     assert {"side_accuracy", "side_majority", "plan_exact", "base/joint/steps"} <= set(metrics("base"))
+    assert metrics("corrections") | {"seconds": 0} == {
+        "episodes": 4.0, "kept_episodes": 4.0, "steps": 12.0, "student_steps": 8.0, "student_as_expert": 0.5, "seconds": 0,
+    }  # fmt: skip
     assert metrics("pointmap")["point_median_m"] > 0.0
     assert {"clips_mpjpe_mm", "clips_hands_feet_mm", "codes_used", "perplexity"} <= set(metrics("tokenizer"))
     assert {"arm_accuracy", "shift_accuracy", "plan_exact"} <= set(metrics("alignment"))
+
+
+def test_corrections_follow_the_demonstrations(trained: Pipeline) -> None:
+    model = trained.cfg.model
+    alone, joined = Demos(trained.paths.shards("demos"), model), trained.demos(model)
+    count = len(alone.motions)
+    assert len(joined.motions) == count + 12
+    assert [joined.target(i) for i in (0, count - 1)] == [alone.target(i) for i in (0, count - 1)]
+    assert [joined.target(count + i) for i in range(12)] == [alone.target(i) for i in range(12)]
+    assert {joined.reader[i]["episode"] for i in joined.finals} > {alone.reader[i]["episode"] for i in alone.finals}
+    none = dataclasses.replace(trained.cfg, corrections=dataclasses.replace(trained.cfg.corrections, episodes=0))
+    assert len(Pipeline(none).demos(model).motions) == count
+
+
+def test_the_control_trains_without_motion(trained: Pipeline) -> None:
+    control = Pipeline(dataclasses.replace(trained.cfg, variant="no_proprio"), collect)
+    assert control.run("alignment") is not None
+    assert control.run("selu") is not None
+    model = load_model(control.paths.model("selu"))
+    assert not model.cfg.proprioception
+    assert model.cse is None
+    assert not (control.paths.model("selu") / "motion").exists()
+    phases = {path.name for path in control.paths.stage("alignment").iterdir() if path.is_dir()}
+    assert phases == {"joint", "model"}
 
 
 def test_oracle_selu_keeps_the_success_and_relabels_the_failure(trained: Pipeline) -> None:
@@ -144,7 +191,7 @@ def test_a_phase_changes_only_its_groups(trained: Pipeline, phase: str) -> None:
     from proprio_mllm.model.groups import group_of
     from proprio_mllm.model.motion_tokenizer import MotionTokenizer
     from proprio_mllm.training.alignment import AlignmentData
-    from proprio_mllm.training.sources import Clips, Demos, Views
+    from proprio_mllm.training.sources import Clips, Views
 
     model = trained._start_alignment()
     shards, cfg = trained.paths.shards, trained.cfg.alignment
@@ -181,7 +228,7 @@ def test_variants() -> None:
     assert variant_model(model, "no_mpe").mpe.mode == "mrope"
     assert variant_model(model, "no_mpe").cse.enabled
     assert not variant_model(model, "no_mpe_cse").cse.enabled
-    with pytest.raises(ValueError, match="variant 'half'; allowed: full, no_mpe, no_cse, no_mpe_cse"):
+    with pytest.raises(ValueError, match="variant 'half'; allowed: full, no_mpe, no_cse, no_mpe_cse, no_proprio"):
         variant_model(model, "half")
 
 
@@ -189,9 +236,9 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     written = release.export(trained, tmp_path)
     assert [folder.name for folder in written] == ["base", "full"]
     about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
-    assert list(about["stages"]) == ["base", "pointmap", "tokenizer", "alignment", "selu"]
+    assert list(about["stages"]) == ["base", "corrections", "pointmap", "tokenizer", "alignment", "selu"]
     assert all(stage["command"] == "python train.py stage=all" and stage["metrics"] for stage in about["stages"].values())
-    assert set(about["shards"]) == {"clips", "views", "demos"}
+    assert set(about["shards"]) == {"clips", "views", "demos", "corrections"}
     ours, released = load_model(trained.paths.model("selu")), load_model(tmp_path / "tiny" / "full")
     theirs = dict(released.named_parameters())
     assert all(tensor.dtype == torch.float32 for tensor in theirs.values())

@@ -1,0 +1,91 @@
+"""Corrections (DAgger): a model acts on training tasks and the expert names the step it would have taken in each state.
+
+Demonstrations hardly show what follows a learned planner's own mistakes: placing with an empty hand, picking up what it holds,
+asking for an object it has not seen. The base model's mistakes, each with the expert's next step, join the demonstrations of
+stages 2 and 3. This is the bridge that `train.py` wires: training asks with a `CorrectionRequest` and reads `demos` shards.
+
+Part files are a function of the request and their number, so a run can be killed and continued. The paper has no such data; its
+pretrained backbone reads feedback in plain words already.
+"""
+
+from __future__ import annotations
+
+import functools
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any, Final
+
+from tqdm import tqdm
+
+from configs.schema.collect import CollectConfig
+from data.records import Observation, PlanStep
+from data.shards import ShardWriter
+from data.workers import start_worker
+from proprio_mllm.training.rollouts import CorrectionRequest
+
+__all__ = ["collect_corrections"]
+
+_PER_PART: Final = 10
+
+
+def collect_corrections(request: CorrectionRequest, robots: Sequence[str] = ("h1", "x1"), workers: int = 2) -> None:
+    """Lets the model act and writes a complete `demos` folder; an interrupted one is continued part by part.
+
+    Args:
+        request: the model, how many episodes, and where they go.
+        robots: robots, in turn.
+        workers: processes; 1 stays in this one.
+    """
+    writer = ShardWriter(request.folder, "demos", request.config_hash, overwrite=True)
+    config = CollectConfig(
+        "demos", str(request.folder), request.episodes, tuple(robots), seed=request.seed, image_size=request.image_size,
+        part_size=_PER_PART, noise=request.expert_share,
+    )  # fmt: skip
+    count = -(-request.episodes // _PER_PART)
+    missing = writer.missing(count)
+    with tqdm(total=count, initial=count - len(missing), desc="corrections", unit="part") as bar:
+        for part, rows in _computed(config, missing, str(request.model), workers):
+            writer.write(part, rows)
+            bar.update(1)
+    writer.finish({"student": str(request.model), "expert_share": request.expert_share})
+
+
+def _computed(
+    config: CollectConfig, missing: Sequence[int], model: str, workers: int
+) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    """Parts as they are finished."""
+    if workers == 1 or len(missing) < 2:
+        for part in missing:
+            yield part, _part(config, part, model)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(missing)), mp_context=context, initializer=start_worker) as pool:
+        futures = {pool.submit(_part, config, part, model): part for part in missing}
+        for future in as_completed(futures):
+            yield futures.pop(future), future.result()
+
+
+def _part(config: CollectConfig, part: int, model: str) -> list[dict[str, Any]]:
+    """One part; imports simulator and model only here, so that workers start light."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from sim.demonstrations import corrections_of_part
+
+    return list(corrections_of_part(config, part, _student(model)))
+
+
+@functools.cache
+def _student(model: str) -> Callable[[Observation], PlanStep | None]:
+    import torch
+
+    from proprio_mllm.planners.mllm import MllmPlanner
+
+    torch.set_num_threads(1)
+    planner = MllmPlanner.load(Path(model))
+
+    def step(observation: Observation) -> PlanStep | None:
+        return planner.step(observation, None).step
+
+    return step
