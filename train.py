@@ -1,8 +1,8 @@
 """Trains Proprio-MLLM: `python train.py stage=all model=tiny` (paper, three stages; `stage=base` stands in for pretraining).
 
-Stages: data (motions to clips shards), collect (views and demonstrations), base, corrections (the base model acts, the expert
-corrects it), pointmap, tokenizer, alignment, selu; `all` runs them in order and skips what is current. Options are documented
-in configs/schema/train.py.
+Stages: data (motions to clips shards), collect (views, exercises, demonstrations), base, corrections (the base model acts, the
+expert corrects it), pointmap, tokenizer, alignment, selu; `all` runs them in order and skips what is current. Options are
+documented in configs/schema/train.py.
 """
 
 from __future__ import annotations
@@ -36,13 +36,17 @@ def make_data(cfg: TrainConfig) -> None:
 
 
 def make_shards(cfg: TrainConfig) -> None:
-    """Posed views, and the expert's demonstrations on training tasks."""
+    """Posed views, exercises in words, and the expert's demonstrations on training tasks."""
     from configs.schema.collect import CollectConfig as ShardConfig
     from proprio_mllm.training.paths import StagePaths
     from sim.collect import collect
 
-    wanted: tuple[tuple[Literal["views", "demos"], int, int], ...]
-    wanted = (("views", cfg.collect.views, 240), ("demos", cfg.collect.episodes, 10))
+    wanted: tuple[tuple[Literal["views", "exercises", "demos"], int, int], ...]
+    wanted = (
+        ("views", cfg.collect.views, 240),
+        ("exercises", cfg.collect.exercises, 1000),
+        ("demos", cfg.collect.episodes, 10),
+    )
     for kind, count, part in wanted:
         out = StagePaths(cfg).shards(kind)
         shards = ShardConfig(

@@ -1,9 +1,9 @@
 """Columns of each kind of shard; changing them means a new `data.shards.SCHEMA_VERSION`.
 
 Paper: none (engineering). `views`: posed views with truth for the point map and dense pretraining. `clips`: motion with
-captions and replayed views, stage 2. `demos`: expert steps. `rollouts`: SELU's trajectories, one row per episode, stage 3;
-images, motions and cameras have one entry per step and one for the end. `privileged` is for audits only: no loss or prompt
-may read it.
+captions and replayed views, stage 2. `demos`: expert steps. `exercises`: planning steps in words alone. `rollouts`: SELU's
+trajectories, one row per episode, stage 3; images, motions and cameras have one entry per step and one for the end.
+`privileged` is for audits only: no loss or prompt may read it.
 """
 
 from __future__ import annotations
@@ -76,6 +76,17 @@ KINDS: Final[Mapping[str, Mapping[str, Any]]] = {
         "history": _list({"step": _TEXT, "feedback": _TEXT}),
         "target": _TEXT,
         "privileged": _TEXT,
+    },
+    "exercises": {
+        "instruction": _TEXT,
+        "robot": _TEXT,
+        "category": _TEXT,
+        "step": _INT,
+        "step_budget": _INT,
+        "visible": _list(_TEXT),
+        "known": _list(_TEXT),
+        "history": _list({"step": _TEXT, "feedback": _TEXT}),
+        "target": _TEXT,
     },
     "rollouts": {
         "episode": _TEXT,

@@ -1,4 +1,4 @@
-"""Collects training shards in the simulator: posed views, and demonstrations of the expert.
+"""Collects training shards: posed views and demonstrations of the expert from the simulator, and exercises in words.
 
     python -m sim.collect kind=views out=outputs/views count=4800 workers=2
     python -m sim.collect kind=demos out=outputs/demos count=600 workers=2
@@ -32,9 +32,13 @@ __all__ = ["collect", "main", "parts_of", "rows_of_part"]
 _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.
-_VERSION = 3
+_VERSION = {"views": 2, "demos": 3, "exercises": 1}
 #: Fields that do not change what is written.
-_UNKEYED = {"views": ("out", "workers", "noise", "medium_share"), "demos": ("out", "workers", "views_per_world")}
+_UNKEYED = {
+    "views": ("out", "workers", "noise", "medium_share"),
+    "demos": ("out", "workers", "views_per_world"),
+    "exercises": ("out", "workers", "views_per_world", "image_size", "noise", "medium_share"),
+}
 
 
 def parts_of(config: CollectConfig) -> int:
@@ -48,6 +52,10 @@ def rows_of_part(config: CollectConfig, part: int) -> list[dict[str, Any]]:
         from sim.posed_views import views_of_part
 
         return list(views_of_part(config, part))
+    if config.kind == "exercises":
+        from sim.paper_world import exercises_of_part
+
+        return list(exercises_of_part(config, part))
     from sim.demonstrations import demos_of_part
 
     return list(demos_of_part(config, part))
@@ -64,7 +72,9 @@ def collect(config: CollectConfig, progress: Callable[[int, int], None] | None =
     Raises:
         data.shards.ShardError: when the folder holds something else and `overwrite` is off.
     """
-    keyed = {k: v for k, v in dataclasses.asdict(config).items() if k not in _UNKEYED[config.kind]} | {"version": _VERSION}
+    keyed = {k: v for k, v in dataclasses.asdict(config).items() if k not in _UNKEYED[config.kind]} | {
+        "version": _VERSION[config.kind]
+    }
     writer = ShardWriter(Path(config.out), config.kind, config_hash(keyed), overwrite)
     total = parts_of(config)
     missing = writer.missing(total)

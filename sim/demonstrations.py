@@ -29,6 +29,8 @@ from sim.tasks.task import Task
 
 __all__ = ["Episode", "Student", "corrections_of_part", "demos_of_part", "perturbed", "run_correction", "run_episode"]
 
+#: Plays one episode of a collection with the sessions it may reuse.
+Play = Callable[[CollectConfig, int, dict[tuple[str, str], Session]], "Episode"]
 #: A planner that learns: the step it would take, None when its reply is no step.
 Student = Callable[[Observation], PlanStep | None]
 
@@ -61,12 +63,7 @@ class Episode:
 
 def demos_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
     """Rows of one part of a `demos` folder; the same for the same configuration, whoever computes it."""
-    first = part * config.part_size
-    sessions: dict[tuple[str, str], Session] = {}
-    for index in range(first, min(first + config.part_size, config.count)):
-        episode = run_episode(config, index, sessions)
-        if episode.success:
-            yield from episode.rows
+    yield from _rows_of_part(config, part, run_episode)
 
 
 def run_episode(config: CollectConfig, index: int, sessions: dict[tuple[str, str], Session] | None = None) -> Episode:
@@ -97,24 +94,32 @@ def run_episode(config: CollectConfig, index: int, sessions: dict[tuple[str, str
 
 def corrections_of_part(config: CollectConfig, part: int, student: Student) -> Iterator[dict[str, Any]]:
     """Rows of one part of a `demos` folder whose steps the student chose and the expert corrected."""
+    yield from _rows_of_part(config, part, lambda cfg, index, sessions: run_correction(cfg, index, sessions, student))
+
+
+def _rows_of_part(config: CollectConfig, part: int, play: Play) -> Iterator[dict[str, Any]]:
     first = part * config.part_size
     sessions: dict[tuple[str, str], Session] = {}
-    for index in range(first, min(first + config.part_size, config.count)):
-        episode = run_correction(config, index, student, sessions)
-        if episode.success:
-            yield from episode.rows
+    try:
+        for index in range(first, min(first + config.part_size, config.count)):
+            episode = play(config, index, sessions)
+            if episode.success:
+                yield from episode.rows
+    finally:
+        for session in sessions.values():
+            session.close()
 
 
 def run_correction(
-    config: CollectConfig, index: int, student: Student, sessions: dict[tuple[str, str], Session] | None = None
+    config: CollectConfig, index: int, sessions: dict[tuple[str, str], Session] | None, student: Student
 ) -> Episode:
     """Plays one episode in which a student acts and the expert names the step it would have taken.
 
     Args:
         config: the collection; `noise` is the share of steps that the expert takes itself.
         index: number of the episode.
-        student: the learned planner.
         sessions: sessions by (robot, difficulty), reused between episodes.
+        student: the learned planner.
     """
     rng = rng_for("corrections", config.seed, index)
     sessions = {} if sessions is None else sessions

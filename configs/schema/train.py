@@ -150,11 +150,13 @@ class CollectConfig:
 
     Attributes:
         views: posed views.
+        exercises: episodes in words alone.
         episodes: expert episodes.
         workers: processes.
     """
 
     views: int = 6000
+    exercises: int = 2000
     episodes: int = 500
     workers: int = 2
 

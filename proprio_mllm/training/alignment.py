@@ -9,7 +9,7 @@
 "Freeze the image and text weights separately" leaves open which weights; this reading freezes one modality's while the other's
 pairs train. Besides clip captions, motion and image to text holds questions about the robot's own body in its scene (which arm
 reaches an object, how far the body must go down). A share of planning demonstrations, with motion tokens in the prompt, keeps
-the planner's format, and exercises in text alone (`exercises`) keep what the base stage learnt from them; the paper does not
+the planner's format, and exercises in text alone keep what the base stage learnt from them; the paper does not
 mention any such replay. Corrections (`stage=corrections`) count as demonstrations here.
 
 The control `variant=no_proprio` has the joint phase alone, and of its pairs those that need no motion.
@@ -32,7 +32,7 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, described_motion, filled_motion, looking, made_motion
 from proprio_mllm.training.judging import judge_example
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Views
 
 __all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Phase"]
 
@@ -58,9 +58,16 @@ class AlignmentData:
     """Examples of every kind, with motion tokens computed once."""
 
     def __init__(
-        self, model: ProprioMLLM, tokenizer: MotionTokenizer, clips: Clips, views: Views, demos: Demos, cfg: AlignmentConfig
+        self,
+        model: ProprioMLLM,
+        tokenizer: MotionTokenizer,
+        clips: Clips,
+        views: Views,
+        demos: Demos,
+        exercises: Exercises,
+        cfg: AlignmentConfig,
     ) -> None:
-        self.tokenizer, self.clips, self.views, self.demos = tokenizer, clips, views, demos
+        self.tokenizer, self.clips, self.views, self.demos, self.exercises = tokenizer, clips, views, demos, exercises
         self._cfg, self._collator = cfg, Collator(model.processor, model.cfg)
         self._style: Style = model.cfg.prompt
         self._proprioception = model.cfg.proprioception
@@ -74,7 +81,7 @@ class AlignmentData:
     def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> Batch:
         """A batch of one kind from the training rows."""
         if kind == "exercise":
-            return self._collator([self.demos.exercise(rng) for _ in range(size)])
+            return self._collator([self.exercises.draw(rng) for _ in range(size)])
         if kind == "plan":
             rows = self.demos.draw(rng, size)
             return self._collator([self._plan(int(i), rng) for i in rows])

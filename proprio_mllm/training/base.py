@@ -2,9 +2,8 @@
 
 Three parts, each needed (a small model trained on questions alone never binds words to image regions): dense, name-tied
 pretraining of the vision tower on the simulator's truth; grounding questions packed per image and image-to-text listing;
-planning demonstrations without proprioception, with judging questions about the expert's logs among them, and exercises in
-text alone on the same logs (`exercises`). Its result is also
-the table row "Qwen2.5-VL-Ins" at this size. The paper has no such stage.
+planning demonstrations without proprioception, with judging questions about the expert's logs among them, and planning
+exercises in text alone. Its result is also the table row "Qwen2.5-VL-Ins" at this size. The paper has no such stage.
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ from proprio_mllm.model.dense import DenseHead, DenseTargets, dense_targets
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
 from proprio_mllm.training.judging import judge_example
-from proprio_mllm.training.sources import GROUNDING, Demos, Views
+from proprio_mllm.training.sources import GROUNDING, Demos, Exercises, Views
 
-__all__ = ["DenseObjective", "JointObjective", "grounding_accuracy", "plan_accuracy"]
+__all__ = ["DenseObjective", "JointObjective", "exercise_accuracy", "grounding_accuracy", "plan_accuracy"]
 
 
 class _WithDense(nn.Module):
@@ -115,16 +114,25 @@ class JointObjective(_Base):
 
     name = "base/joint"
 
-    def __init__(self, model: ProprioMLLM, head: DenseHead, views: Views, demos: Demos, cfg: BaseConfig, key: str) -> None:
+    def __init__(
+        self,
+        model: ProprioMLLM,
+        head: DenseHead,
+        views: Views,
+        demos: Demos,
+        exercises: Exercises,
+        cfg: BaseConfig,
+        key: str,
+    ) -> None:
         super().__init__(model, head, views, cfg, key)
-        self._demos = demos
+        self._demos, self._exercises = demos, exercises
 
     def batch(self, rng: np.random.Generator, size: int) -> _JointBatch:
         """A batch of views or of planning steps."""
         if rng.random() >= self._cfg.plan_share:
             return self._view_batch(rng, size, self._cfg.questions)
         if rng.random() < self._cfg.exercise_share:
-            return _JointBatch("exercise", self._collator([self._demos.exercise(rng) for _ in range(size)]), None, None, 0.0)
+            return _JointBatch("exercise", self._collator([self._exercises.draw(rng) for _ in range(size)]), None, None, 0.0)
         examples = [
             judge_example(self._demos, i, rng, None) if rng.random() < self._cfg.judge_share else self._demos.example(i, None)
             for i in self._demos.draw(rng, size)
@@ -174,6 +182,20 @@ def grounding_accuracy(
         result[f"{kind}_majority"] = max(answers.count(a) for a in set(answers)) / len(asked)
     result["asked_views"] = float(len(rows))
     return result
+
+
+@torch.no_grad()
+def exercise_accuracy(model: ProprioMLLM, exercises: Exercises, limit: int = 200) -> dict[str, float]:
+    """Share of held-out exercises in text alone that the model's greedy reply repeats exactly."""
+    collator = Collator(model.processor, model.cfg)
+    order = exercises.test[:: max(1, len(exercises.test) // limit)][:limit]
+    exact = 0
+    for start in range(0, len(order), 16):
+        chunk = [int(i) for i in order[start : start + 16]]
+        batch = collator([exercises.example(i, answered=False) for i in chunk], generation=True).to(model.device)
+        replies = model.reply(batch, 40)
+        exact += sum(reply.strip() == exercises.target(i) for i, reply in zip(chunk, replies, strict=True))
+    return {"exercise_exact": exact / max(len(order), 1), "exercise_steps": float(len(order))}
 
 
 @torch.no_grad()

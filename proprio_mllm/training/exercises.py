@@ -1,4 +1,4 @@
-"""Planning exercises in text alone: steps of the expert's logs with names exchanged among equals.
+"""Steps of the expert's logs as planning exercises in text alone, with names exchanged among equals.
 
 What to do next follows mostly from the instruction, the log and the names, and a model without pretraining has to learn that
 from a few thousand logged steps, far too few to tell one name from another. An exercise is a logged step in which object types

@@ -1,8 +1,8 @@
 """Runs the training stages in order, each skipped while its output is current.
 
-base needs views, demos and clips (for the tokenizer's text); corrections need base; pointmap needs views; tokenizer needs clips
-and the windows of views and demos; alignment needs base, corrections, pointmap and tokenizer; selu needs alignment. The
-variants of the ablation share everything up to alignment and then train with the same budget.
+base needs views, exercises, demos and clips (for the tokenizer's text); corrections need base; pointmap needs views; tokenizer
+needs clips and the windows of views and demos; alignment needs base, corrections, pointmap and tokenizer; selu needs alignment.
+The variants of the ablation share everything up to alignment and then train with the same budget.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective
-from proprio_mllm.training.base import DenseObjective, JointObjective, grounding_accuracy, plan_accuracy
+from proprio_mllm.training.base import DenseObjective, JointObjective, exercise_accuracy, grounding_accuracy, plan_accuracy
 from proprio_mllm.training.geometry_stage import PointMapObjective, point_map_error
 from proprio_mllm.training.loop import Objective, run_loop
 from proprio_mllm.training.metrics import MetricWriter
 from proprio_mllm.training.motion_stage import MotionObjective, MotionWindows, tokenizer_metrics
 from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_key
 from proprio_mllm.training.rollouts import CorrectionRequest
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views, shard_hash
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Views, shard_hash
 from proprio_mllm.training.text import corpus, whole_words
 
 __all__ = ["NEEDS", "STAGES", "Pipeline", "StageError", "variant_model"]
@@ -104,7 +104,7 @@ class Pipeline:
         cfg, shards = self.cfg, self.paths.shards
         plain = dataclasses.asdict(base_model_config(cfg.model))
         if name == "base":
-            inputs = {kind: shard_hash(shards(kind)) for kind in ("views", "demos", "clips")}
+            inputs = {kind: shard_hash(shards(kind)) for kind in ("views", "exercises", "demos", "clips")}
             return stage_key({"base": dataclasses.asdict(cfg.base), "model": plain}, cfg.seed, inputs)
         if name == "corrections":
             wanted = {"episodes": cfg.corrections.episodes, "expert_share": cfg.corrections.expert_share}
@@ -180,10 +180,11 @@ class Pipeline:
         dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
         self._train_dense(dense, model, head, folder / "dense")
         model.requires_grad_(True)
-        joint = JointObjective(model, head, views, demos, cfg.base, f"{key}/joint")
+        exercises = Exercises(self.paths.shards("exercises"), plain, demos)
+        joint = JointObjective(model, head, views, demos, exercises, cfg.base, f"{key}/joint")
         self.loop(joint, cfg.base.joint, folder / "joint")
         save_model(model.eval(), self.paths.model("base"))
-        return {**grounding_accuracy(model, views), **plan_accuracy(model, demos)}
+        return {**grounding_accuracy(model, views), **plan_accuracy(model, demos), **exercise_accuracy(model, exercises)}
 
     def _corrections(self, folder: Path, key: str) -> Metrics:
         cfg = self.cfg.corrections
@@ -262,7 +263,8 @@ class Pipeline:
         model = self._start_alignment()
         tokenizer = MotionTokenizer.load(self.paths.model("tokenizer"))
         views, demos = Views(self.paths.shards("views"), model.cfg), self.demos(model.cfg)
-        data = AlignmentData(model, tokenizer, Clips(self.paths.shards("clips")), views, demos, self.cfg.alignment)
+        exercises = Exercises(self.paths.shards("exercises"), model.cfg, demos)
+        data = AlignmentData(model, tokenizer, Clips(self.paths.shards("clips")), views, demos, exercises, self.cfg.alignment)
         # without proprioception there is nothing to align apart
         wanted = PHASES if model.cfg.proprioception else ("joint",)
         loops = {phase: getattr(self.cfg.alignment, phase) for phase in wanted}
@@ -272,7 +274,7 @@ class Pipeline:
         read = tokenizer if model.cfg.proprioception else None
         save_model(model.eval(), self.paths.model("alignment"), read)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
-        return {**asked, **plan_accuracy(model, demos, read)}
+        return {**asked, **plan_accuracy(model, demos, read), **exercise_accuracy(model, exercises)}
 
     def _selu(self, folder: Path, key: str) -> Metrics:
         from proprio_mllm.training.selu import run_selu

@@ -31,12 +31,14 @@ from proprio_mllm.model.prompts import Style, answers, plan_prompt, with_answer
 from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
 from proprio_mllm.training.exercises import Exchange, is_symbolic
 
-__all__ = ["Clips", "Demos", "Views", "held_out", "shard_hash"]
+__all__ = ["Clips", "Demos", "Exercises", "Views", "held_out", "shard_hash"]
 
 #: One in this many views, episodes and clips is never trained on.
 HELD_OUT = 20
 GROUNDING = ("side", "distance", "height")
 BODY_RELATIVE = ("arm", "shift")
+#: Share of exercises that are the expert's own logs with names exchanged; the others come from the exercises' shards.
+FROM_LOGS = 0.25
 
 
 def held_out(key: str) -> bool:
@@ -147,6 +149,27 @@ class Views:
         return "see?", answers([str(thing["id"]) for thing in ordered][:8])
 
 
+def _planning(row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelConfig) -> tuple[Message, ...]:
+    """The planner's prompt of a row."""
+    return plan_prompt(
+        row["instruction"],
+        row["robot"],
+        row["visible"],
+        row["known"],
+        [HistoryItem(item["step"], item["feedback"]) for item in row["history"]],
+        int(row["step"]),
+        int(row["step_budget"]),
+        motion,
+        cfg.prompt,
+        cfg.history,
+    )
+
+
+def _in_words(row: Mapping[str, Any], cfg: ModelConfig) -> list[Message]:
+    """The same without the picture."""
+    return [replace(message, images=0) for message in _planning(row, None, cfg)]
+
+
 class _Joined:
     """Several `demos` folders read as one, in order."""
 
@@ -207,29 +230,14 @@ class Demos:
     def example(self, index: int, motion: Sequence[int] | None, answered: bool = True) -> Example:
         """The step's conversation; `motion` None leaves proprioception out of the prompt."""
         row = self.reader[int(index)]
-        prompt = self._prompt(row, motion)
+        prompt = _planning(row, motion, self._cfg)
         return Example(with_answer(prompt, row["target"]) if answered else prompt, (self.view(row),))
 
     def exercise(self, rng: np.random.Generator) -> Example:
         """A step in text alone, names exchanged (see `exercises`)."""
         row = self.reader[int(rng.choice(self._symbolic))]
         exchanged = Exchange.draw(rng).row(row)
-        messages = [replace(message, images=0) for message in self._prompt(exchanged, None)]
-        return Example(with_answer(messages, exchanged["target"]))
-
-    def _prompt(self, row: Mapping[str, Any], motion: Sequence[int] | None) -> tuple[Message, ...]:
-        return plan_prompt(
-            row["instruction"],
-            row["robot"],
-            row["visible"],
-            row["known"],
-            [HistoryItem(item["step"], item["feedback"]) for item in row["history"]],
-            int(row["step"]),
-            int(row["step_budget"]),
-            motion,
-            self._cfg.prompt,
-            self._cfg.history,
-        )
+        return Example(with_answer(_in_words(exchanged, self._cfg), exchanged["target"]))
 
     def view(self, row: Mapping[str, Any]) -> View:
         """The head-camera view of a row."""
@@ -238,6 +246,39 @@ class Demos:
 
     def target(self, index: int) -> str:
         """The expert's step."""
+        return str(self.reader[int(index)]["target"])
+
+
+class Exercises:
+    """Planning exercises in text alone: those of the shards (`sim.paper_world` writes them), and logs with names exchanged.
+
+    Args:
+        folder: `exercises` shards.
+        cfg: the model's.
+        demos: the logs.
+    """
+
+    def __init__(self, folder: Path, cfg: ModelConfig, demos: Demos) -> None:
+        self.reader = ShardReader(folder, "exercises")
+        self._cfg, self._demos = cfg, demos
+        # rows of an episode stand together: the last ones are held out
+        self._train = len(self.reader) - len(self.reader) // HELD_OUT
+        self.test = np.arange(self._train, len(self.reader), dtype=np.int64)
+
+    def draw(self, rng: np.random.Generator) -> Example:
+        """A training example."""
+        if rng.random() < FROM_LOGS:
+            return self._demos.exercise(rng)
+        return self.example(int(rng.integers(self._train)))
+
+    def example(self, index: int, answered: bool = True) -> Example:
+        """One row's conversation."""
+        row = self.reader[int(index)]
+        prompt = _in_words(row, self._cfg)
+        return Example(with_answer(prompt, row["target"]) if answered else tuple(prompt))
+
+    def target(self, index: int) -> str:
+        """The right step."""
         return str(self.reader[int(index)]["target"])
 
 

@@ -99,8 +99,8 @@ def test_a_students_mistakes_are_recorded_with_the_experts_step():
     def student(observation):
         return PlanStep((Action("Place", arm=Arm.RIGHT, object_id=observation.known_objects[0]),))
 
-    episode = run_correction(config, 10, student)
-    again = run_correction(config, 10, student)
+    episode = run_correction(config, 10, None, student)
+    again = run_correction(config, 10, None, student)
     for name in ("target", "image", "history", "privileged"):
         assert [row[name] for row in episode.rows] == [row[name] for row in again.rows]
     assert episode.success
@@ -110,7 +110,7 @@ def test_a_students_mistakes_are_recorded_with_the_experts_step():
     assert {row["target"] for row in episode.rows} <= {note["executed"] for note in notes if note["origin"] == "expert"}
     # a step that has just failed is not tried again: the expert takes over
     assert [note["origin"] for note in notes[:2]] == ["student", "expert"]
-    assert run_correction(config, 10, lambda observation: None).rows[-1]["target"] == episode.rows[-1]["target"]
+    assert run_correction(config, 10, None, lambda observation: None).rows[-1]["target"] == episode.rows[-1]["target"]
 
 
 class _Seen:
@@ -134,7 +134,7 @@ def test_perturbed_steps_are_legal_and_differ(step):
 
 def test_arguments_are_read_and_wrong_ones_refused(capsys):
     assert parse(["kind=views", "out=x", "count=3", "robots=[x1]"]).robots == ("x1",)
-    with pytest.raises(ConfigError, match="views, demos"):
+    with pytest.raises(ConfigError, match="views, demos, exercises"):
         parse(["kind=pictures", "out=x", "count=3"])
     with pytest.raises(ConfigError, match="'count' is not key=value"):
         parse(["count"])

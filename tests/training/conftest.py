@@ -142,6 +142,31 @@ def write_demos(folder: Path, episodes: int = 40) -> Path:
     return folder
 
 
+def write_exercises(folder: Path, episodes: int = 30) -> Path:
+    rows = []
+    for episode in range(episodes):
+        target = f"{TYPES[episode % len(TYPES)]}_1"
+        for step, template in enumerate(PLAN):
+            text = template.replace("Mug_1", target)
+            rows.append(
+                {
+                    "instruction": f"Pick up the {target.split('_')[0].lower()}.",
+                    "robot": "h1",
+                    "category": "single",
+                    "step": step,
+                    "step_budget": 8,
+                    "visible": [target],
+                    "known": [target, "CoffeeTable_2"],
+                    "history": [{"step": "MoveAhead(0.1)", "feedback": "MoveAhead(0.1) ok"}] * step,
+                    "target": text,
+                }
+            )
+    writer = ShardWriter(folder, "exercises", "test")
+    writer.write(0, rows)
+    writer.finish({})
+    return folder
+
+
 def write_clips(folder: Path, count: int = 40) -> Path:
     rng = np.random.default_rng(3)
     rows = []
@@ -180,10 +205,11 @@ def one_thread() -> None:
 
 @pytest.fixture(scope="session")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with `views`, `demos` and `clips`."""
+    """A folder with `views`, `exercises`, `demos` and `clips`."""
     root = tmp_path_factory.mktemp("shards")
     write_views(root / "views", 60)
     write_demos(root / "demos")
+    write_exercises(root / "exercises")
     write_clips(root / "clips")
     return root
 

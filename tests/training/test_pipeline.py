@@ -135,7 +135,7 @@ def test_metrics_are_reported(trained: Pipeline) -> None:
     def metrics(stage: str) -> dict[str, float]:
         return json.loads((trained.paths.stage(stage) / "done.json").read_text())["metrics"]
 
-    assert {"side_accuracy", "side_majority", "plan_exact", "base/joint/steps"} <= set(metrics("base"))
+    assert {"side_accuracy", "side_majority", "plan_exact", "exercise_exact", "base/joint/steps"} <= set(metrics("base"))
     assert metrics("corrections") | {"seconds": 0} == {
         "episodes": 4.0, "kept_episodes": 4.0, "steps": 12.0, "student_steps": 8.0, "student_as_expert": 0.5, "seconds": 0,
     }  # fmt: skip
@@ -191,13 +191,14 @@ def test_a_phase_changes_only_its_groups(trained: Pipeline, phase: str) -> None:
     from proprio_mllm.model.groups import group_of
     from proprio_mllm.model.motion_tokenizer import MotionTokenizer
     from proprio_mllm.training.alignment import AlignmentData
-    from proprio_mllm.training.sources import Clips, Views
+    from proprio_mllm.training.sources import Clips, Exercises, Views
 
     model = trained._start_alignment()
     shards, cfg = trained.paths.shards, trained.cfg.alignment
     tokenizer = MotionTokenizer.load(trained.paths.model("tokenizer"))
     views, demos = Views(shards("views"), model.cfg), Demos(shards("demos"), model.cfg)
-    data = AlignmentData(model, tokenizer, Clips(shards("clips")), views, demos, cfg)
+    exercises = Exercises(shards("exercises"), model.cfg, demos)
+    data = AlignmentData(model, tokenizer, Clips(shards("clips")), views, demos, exercises, cfg)
     train_only(model, PHASES[phase].groups)
     before = {name: tensor.detach().clone() for name, tensor in model.named_parameters()}
     trained.loop(AlignmentObjective(model, data, phase, cfg, "test"), cfg.joint, trained.paths.root / f"groups-{phase}")
@@ -238,7 +239,7 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
     assert list(about["stages"]) == ["base", "corrections", "pointmap", "tokenizer", "alignment", "selu"]
     assert all(stage["command"] == "python train.py stage=all" and stage["metrics"] for stage in about["stages"].values())
-    assert set(about["shards"]) == {"clips", "views", "demos", "corrections"}
+    assert set(about["shards"]) == {"clips", "views", "exercises", "demos", "corrections"}
     ours, released = load_model(trained.paths.model("selu")), load_model(tmp_path / "tiny" / "full")
     theirs = dict(released.named_parameters())
     assert all(tensor.dtype == torch.float32 for tensor in theirs.values())

@@ -1,0 +1,58 @@
+"""Exercises in words: the same for the same number, solvable, and every refusal met with what mends it."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from configs.schema.collect import CollectConfig
+from data.records import PlanStep
+from sim.collect import rows_of_part
+from sim.paper_world import Exercise, play
+
+CONFIG = CollectConfig("exercises", "unused", 300, part_size=300)
+
+
+@pytest.fixture(scope="module")
+def episodes() -> list[Exercise]:
+    return [play(CONFIG, index) for index in range(300)]
+
+
+def test_an_episode_is_a_function_of_its_number(episodes: list[Exercise]) -> None:
+    assert play(CONFIG, 7).rows == episodes[7].rows
+    assert rows_of_part(CONFIG, 0) == [row for episode in episodes for row in episode.rows]
+    assert episodes[7].rows != episodes[8].rows
+
+
+def test_most_episodes_end_in_success_in_spite_of_mistakes(episodes: list[Exercise]) -> None:
+    assert sum(episode.success for episode in episodes) > 270
+    codes = set().union(*(episode.codes for episode in episodes))
+    wanted = {"ok", "TooFar", "BodyTooHigh", "BodyTooLow", "HandEmpty", "HandOccupied", "AlreadyHeld", "AlreadyInState"}
+    assert wanted | {"ObjectNotKnown", "BothHandsBusy", "GraspMissed"} <= codes
+
+
+def test_steps_name_known_objects_and_follow_from_the_log(episodes: list[Exercise]) -> None:
+    heights = 0
+    for row in (row for episode in episodes for row in episode.rows):
+        step = PlanStep.parse(row["target"])
+        assert step.to_text() == row["target"]
+        assert {action.object_id for action in step.actions} - {None} <= set(row["known"])
+        assert set(row["visible"]) <= set(row["known"])
+        codes = [item["feedback"].rsplit(" ", 1)[1] for item in row["history"]]
+        if step.actions[0].name in ("MoveUp", "MoveDown"):
+            heights += 1
+            refused = "BodyTooLow" if step.actions[0].name == "MoveUp" else "BodyTooHigh"
+            assert refused in codes
+        assert not re.match("Rotate|MoveAhead", row["target"])
+        if codes and codes[-1] == "TooFar" and len(step.actions) == 1:
+            last = row["history"][-1]["step"]
+            assert last != row["target"]
+    assert heights > 20
+
+
+def test_what_is_held_already_is_not_picked_again(episodes: list[Exercise]) -> None:
+    for row in (row for episode in episodes for row in episode.rows):
+        if row["history"] and row["history"][-1]["feedback"].endswith("AlreadyHeld"):
+            asked = re.findall(r"Pick\(\w+, (\w+)\)", row["history"][-1]["step"])
+            assert not any(f", {name})" in row["target"] and row["target"].startswith("Pick") for name in asked)
