@@ -41,10 +41,11 @@ def make_shards(cfg: TrainConfig) -> None:
     from proprio_mllm.training.paths import StagePaths
     from sim.collect import collect
 
-    wanted: tuple[tuple[Literal["views", "exercises", "demos"], int, int], ...]
+    wanted: tuple[tuple[Literal["views", "exercises", "judgements", "demos"], int, int], ...]
     wanted = (
         ("views", cfg.collect.views, 240),
         ("exercises", cfg.collect.exercises, 1000),
+        ("judgements", cfg.collect.exercises, 1000),
         ("demos", cfg.collect.episodes, 10),
     )
     for kind, count, part in wanted:

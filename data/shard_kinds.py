@@ -1,9 +1,9 @@
 """Columns of each kind of shard; changing them means a new `data.shards.SCHEMA_VERSION`.
 
 Paper: none (engineering). `views`: posed views with truth for the point map and dense pretraining. `clips`: motion with
-captions and replayed views, stage 2. `demos`: expert steps. `exercises`: planning steps in words alone. `rollouts`: SELU's
-trajectories, one row per episode, stage 3; images, motions and cameras have one entry per step and one for the end.
-`privileged` is for audits only: no loss or prompt may read it.
+captions and replayed views, stage 2. `demos`: expert steps. `exercises`: planning steps in words alone, `judgements`: was it
+done. `rollouts`: SELU's trajectories, one row per episode, stage 3; images, motions and cameras have one entry per step and one
+for the end. `privileged` is for audits only: no loss or prompt may read it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,18 @@ def _list(of: Any) -> Any:
     return datasets.List(of)
 
 
+#: A planning prompt without a picture, and its answer.
+_IN_WORDS: Final[Mapping[str, Any]] = {
+    "instruction": _TEXT,
+    "robot": _TEXT,
+    "category": _TEXT,
+    "step": _INT,
+    "step_budget": _INT,
+    "visible": _list(_TEXT),
+    "known": _list(_TEXT),
+    "history": _list({"step": _TEXT, "feedback": _TEXT}),
+    "target": _TEXT,
+}
 #: Columns of each kind. Motions are flat (T·F,) float32; `decode_motion` restores them.
 KINDS: Final[Mapping[str, Mapping[str, Any]]] = {
     "views": {
@@ -77,17 +89,8 @@ KINDS: Final[Mapping[str, Mapping[str, Any]]] = {
         "target": _TEXT,
         "privileged": _TEXT,
     },
-    "exercises": {
-        "instruction": _TEXT,
-        "robot": _TEXT,
-        "category": _TEXT,
-        "step": _INT,
-        "step_budget": _INT,
-        "visible": _list(_TEXT),
-        "known": _list(_TEXT),
-        "history": _list({"step": _TEXT, "feedback": _TEXT}),
-        "target": _TEXT,
-    },
+    "exercises": _IN_WORDS,
+    "judgements": _IN_WORDS,
     "rollouts": {
         "episode": _TEXT,
         "task": _TEXT,

@@ -32,12 +32,13 @@ __all__ = ["collect", "main", "parts_of", "rows_of_part"]
 _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.
-_VERSION = {"views": 2, "demos": 3, "exercises": 1}
+_VERSION = {"views": 2, "demos": 3, "exercises": 1, "judgements": 1}
 #: Fields that do not change what is written.
 _UNKEYED = {
     "views": ("out", "workers", "noise", "medium_share"),
     "demos": ("out", "workers", "views_per_world"),
     "exercises": ("out", "workers", "views_per_world", "image_size", "noise", "medium_share"),
+    "judgements": ("out", "workers", "views_per_world", "image_size", "noise", "medium_share"),
 }
 
 
@@ -56,6 +57,10 @@ def rows_of_part(config: CollectConfig, part: int) -> list[dict[str, Any]]:
         from sim.paper_world import exercises_of_part
 
         return list(exercises_of_part(config, part))
+    if config.kind == "judgements":
+        from sim.paper_world import judgements_of_part
+
+        return list(judgements_of_part(config, part))
     from sim.demonstrations import demos_of_part
 
     return list(demos_of_part(config, part))

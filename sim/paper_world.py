@@ -7,8 +7,9 @@ everywhere (`sim.tasks.drafts`), the expert's own job planner (`sim.tasks.jobs`)
 are taken are mistakes, so that every refusal is followed by what mends it. Half of the rooms are made up. Steps that only eyes
 could justify (a turn towards something unseen, a change of height that nothing has called for yet) are taken, not recorded.
 
-Rows of `exercises` shards, for training without pictures; no result is ever measured here. The paper starts from a pretrained
-language model instead.
+Rows of `exercises` shards, and of `judgements` shards, which ask whether an instruction has been carried out at a moment of
+such an episode. For training without pictures; no result is ever measured here. The paper starts from a pretrained language
+model instead.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from sim.tasks.drafts import FAMILIES, Draft, NoDraft, Scene, category_of, draw
 from sim.tasks.jobs import Facts, Job, plan_jobs
 from sim.tasks.sample import rng_for, scene_of, typical_steps
 
-__all__ = ["Exercise", "exercises_of_part", "play"]
+__all__ = ["Exercise", "Moment", "exercises_of_part", "judgement", "judgements_of_part", "play"]
 
 #: Earlier steps that a row keeps.
 _HISTORY: Final = 8
@@ -54,17 +55,30 @@ _EXTRAS: Final = ("Sofa", "GarbageCan", "Chair", "TVStand", "SinkBasin")
 _FREE_ARMS: Final = (Arm.RIGHT, Arm.LEFT)
 
 
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """What the robot knows at one time, as columns of a row (without the target)."""
+
+    columns: Mapping[str, Any]
+
+    def row(self, target: str, instruction: str | None = None) -> dict[str, Any]:
+        """A row with this target, under the episode's instruction or another one."""
+        return {**self.columns, "target": target} | ({} if instruction is None else {"instruction": instruction})
+
+
 @dataclass(slots=True)
 class Exercise:
     """One episode.
 
     Attributes:
         rows: recorded steps, ready for a shard.
+        moments: before every step, and at the end.
         success: whether the goals held at the end.
         codes: every outcome code that occurred.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
+    moments: list[Moment] = field(default_factory=list)
     success: bool = False
     codes: set[str] = field(default_factory=set)
 
@@ -93,33 +107,68 @@ def play(config: CollectConfig, index: int) -> Exercise:
     mistakes = float(rng.choice(_MISTAKES))
     exercise = Exercise()
     history: list[dict[str, str]] = []
+
+    def moment(number: int) -> Moment:
+        return Moment(
+            {
+                "instruction": instruction,
+                "robot": robot,
+                "category": category_of(draft.family),
+                "step": number,
+                "step_budget": budget,
+                "visible": list(world.visible),
+                "known": world.known(),
+                "history": history[-_HISTORY:],
+            }
+        )
+
     for number in range(min(budget, _MAX_STEPS)):
+        exercise.moments.append(moment(number))
         answer = world.answer()
         if answer is None:
             break
         target, justified = answer
-        visible = list(world.visible)
         if justified:
-            exercise.rows.append(
-                {
-                    "instruction": instruction,
-                    "robot": robot,
-                    "category": category_of(draft.family),
-                    "step": number,
-                    "step_budget": budget,
-                    "visible": visible,
-                    "known": world.known(),
-                    "history": history[-_HISTORY:],
-                    "target": target.to_text(),
-                }
-            )
+            exercise.rows.append(exercise.moments[-1].row(target.to_text()))
         step = world.mistake(target) if rng.random() < mistakes else target
         outcomes = [(action, world.act(action)) for action in step.actions]
         exercise.codes |= {str(code) for _, code in outcomes}
         feedback = "; ".join(f"{action.to_text()} {code}" for action, code in outcomes)
         history = [*history, {"step": step.to_text(), "feedback": feedback}]
+    else:
+        exercise.moments.append(moment(min(budget, _MAX_STEPS)))
     exercise.success = world.answer() is None
     return exercise
+
+
+def judgements_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
+    """Rows of one part of a `judgements` folder: one question of each episode."""
+    first = part * config.part_size
+    for index in range(first, min(first + config.part_size, config.count)):
+        yield judgement(config, index)
+
+
+def judgement(config: CollectConfig, index: int) -> dict[str, Any]:
+    """Whether the instruction has been carried out: half of the answers are yes.
+
+    A no is about the moment before the last step, an earlier one, the end of an episode that failed, or the end of one that did
+    something else.
+    """
+    rng = rng_for("judgements", config.seed, index)
+    exercise = play(config, index)
+    end = exercise.moments[-1]
+    if not exercise.success:
+        return end.row("no")
+    if rng.random() < 0.5:
+        return end.row("yes")
+    if rng.random() < 0.2:
+        other, scene = _draft(config, rng)
+        instruction = other.sentences(scene.furniture, rng)[0]
+        return end.row("no" if instruction != end.columns["instruction"] else "yes", instruction)
+    earlier = exercise.moments[:-1]
+    if not earlier:
+        return end.row("yes")
+    return (earlier[-1] if rng.random() < 0.5 else earlier[int(rng.integers(len(earlier)))]).row("no")
 
 
 def _draft(config: CollectConfig, rng: np.random.Generator) -> tuple[Draft, Scene]:

@@ -13,7 +13,8 @@ class CollectConfig:
     """What is collected, how much, and where it goes.
 
     Attributes:
-        kind: `views` (posed views), `demos` (expert steps) or `exercises` (planning steps in words alone).
+        kind: `views` (posed views), `demos` (expert steps), `exercises` (planning steps in words alone) or `judgements` (was it
+            done, in words alone).
         out: shard folder.
         count: views, or episodes.
         robots: robots in turn.
@@ -27,7 +28,7 @@ class CollectConfig:
         medium_share: demos: share of episodes at medium difficulty, so that recoveries appear.
     """
 
-    kind: Literal["views", "demos", "exercises"]
+    kind: Literal["views", "demos", "exercises", "judgements"]
     out: str
     count: int
     robots: tuple[str, ...] = ("h1", "x1")

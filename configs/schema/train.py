@@ -104,7 +104,7 @@ class AlignmentConfig:
         joint: loop of phase 2b; rows, LoRA, CSE and merger train.
         plan_share: share of the joint batches that are planning demonstrations with proprioception, or exercises.
         exercise_share: share of exercises in text alone among them.
-        judge_share: share of judging questions among the planning demonstrations.
+        judge_share: share of judging questions among the planning demonstrations, and among the exercises.
         questions: body-relative questions packed per image.
         mask: share of motion tokens hidden in masked motion.
     """
@@ -150,7 +150,7 @@ class CollectConfig:
 
     Attributes:
         views: posed views.
-        exercises: episodes in words alone.
+        exercises: episodes in words alone, for planning and for judging.
         episodes: expert episodes.
         workers: processes.
     """

@@ -32,7 +32,7 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, described_motion, filled_motion, looking, made_motion
 from proprio_mllm.training.judging import judge_example
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Judgements, Views
 
 __all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Phase"]
 
@@ -65,9 +65,11 @@ class AlignmentData:
         views: Views,
         demos: Demos,
         exercises: Exercises,
+        judgements: Judgements,
         cfg: AlignmentConfig,
     ) -> None:
-        self.tokenizer, self.clips, self.views, self.demos, self.exercises = tokenizer, clips, views, demos, exercises
+        self.tokenizer, self.clips, self.views, self.demos = tokenizer, clips, views, demos
+        self.exercises, self.judgements = exercises, judgements
         self._cfg, self._collator = cfg, Collator(model.processor, model.cfg)
         self._style: Style = model.cfg.prompt
         self._proprioception = model.cfg.proprioception
@@ -81,7 +83,8 @@ class AlignmentData:
     def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> Batch:
         """A batch of one kind from the training rows."""
         if kind == "exercise":
-            return self._collator([self.exercises.draw(rng) for _ in range(size)])
+            judged = rng.random(size) < self._cfg.judge_share
+            return self._collator([(self.judgements if one else self.exercises).draw(rng) for one in judged])
         if kind == "plan":
             rows = self.demos.draw(rng, size)
             return self._collator([self._plan(int(i), rng) for i in rows])

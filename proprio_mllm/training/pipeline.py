@@ -33,7 +33,7 @@ from proprio_mllm.training.metrics import MetricWriter
 from proprio_mllm.training.motion_stage import MotionObjective, MotionWindows, tokenizer_metrics
 from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_key
 from proprio_mllm.training.rollouts import CorrectionRequest
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Views, shard_hash
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Judgements, Views, shard_hash
 from proprio_mllm.training.text import corpus, whole_words
 
 __all__ = ["NEEDS", "STAGES", "Pipeline", "StageError", "variant_model"]
@@ -118,7 +118,7 @@ class Pipeline:
             return stage_key(wanted, cfg.seed, inputs)
         model = dataclasses.asdict(variant_model(cfg.model, cfg.variant))
         if name == "alignment":
-            inputs = {stage: self.key(stage) for stage in NEEDS["alignment"]}
+            inputs = {stage: self.key(stage) for stage in NEEDS["alignment"]} | {"judgements": shard_hash(shards("judgements"))}
             return stage_key({"alignment": dataclasses.asdict(cfg.alignment), "model": model}, cfg.seed, inputs)
         if name == "selu":
             return stage_key({"selu": dataclasses.asdict(cfg.selu)}, cfg.seed, {"alignment": self.key("alignment")})
@@ -264,7 +264,9 @@ class Pipeline:
         tokenizer = MotionTokenizer.load(self.paths.model("tokenizer"))
         views, demos = Views(self.paths.shards("views"), model.cfg), self.demos(model.cfg)
         exercises = Exercises(self.paths.shards("exercises"), model.cfg, demos)
-        data = AlignmentData(model, tokenizer, Clips(self.paths.shards("clips")), views, demos, exercises, self.cfg.alignment)
+        judgements = Judgements(self.paths.shards("judgements"), model.cfg)
+        clips = Clips(self.paths.shards("clips"))
+        data = AlignmentData(model, tokenizer, clips, views, demos, exercises, judgements, self.cfg.alignment)
         # without proprioception there is nothing to align apart
         wanted = PHASES if model.cfg.proprioception else ("joint",)
         loops = {phase: getattr(self.cfg.alignment, phase) for phase in wanted}

@@ -3,8 +3,9 @@
 Actor and critic are two LoRA adapters over the stage-2 model: the actor goes on with stage 2's adapter, the critic starts as
 its copy. A round: roll the actor out with a temperature, judge every end, ask oneself and relabel failures keeping the verb,
 fine-tune the critic, judge again, fine-tune the actor on the kept trajectories. Before the first round the critic practises on
-questions about the expert's logs. The critic's agreement with the simulator is reported and, unless `truth=oracle`, never used.
-Part of each batch is replayed demonstrations against forgetting; the abstract of SELU mentions no replay.
+questions about the expert's logs and about episodes in words. The critic's agreement with the simulator is reported and, unless
+`truth=oracle`, never used. Part of each batch is replayed demonstrations against forgetting; the abstract of SELU mentions no
+replay.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from proprio_mllm.training.goals import Relabel
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
+from proprio_mllm.training.sources import Judgements
 
 if TYPE_CHECKING:
     from proprio_mllm.training.pipeline import Pipeline
@@ -50,6 +52,8 @@ logger = logging.getLogger(__name__)
 
 #: Adapter names; the actor's is the one that stage 2 trained.
 ACTOR, CRITIC = "default", "critic"
+#: Share of the critic's practice that is in words alone; the rest is about the expert's logs and pictures.
+IN_WORDS = 0.5
 
 
 class ExampleObjective:
@@ -144,12 +148,15 @@ class _Selu:
             copy_adapter(self.model, ACTOR, CRITIC)
         self.collator = Collator(self.model.processor, self.model.cfg)
         self.demos = self.pipeline.demos(self.model.cfg)
+        self.judgements = Judgements(self.pipeline.paths.shards("judgements"), self.model.cfg)
         self._tokens = None if self.tokenizer is None else self.demos.tokens(self.tokenizer)
 
     def _codes(self, index: int) -> list[int] | None:
         return None if self._tokens is None else self._tokens[index].tolist()
 
     def _judging(self, rng: np.random.Generator) -> Example:
+        if rng.random() < IN_WORDS:
+            return self.judgements.draw(rng)
         index = int(self.demos.draw(rng, 1)[0])
         return judge_example(self.demos, index, rng, self._tokens)
 

@@ -27,11 +27,11 @@ from proprio_mllm.model.batch import Example, View
 from proprio_mllm.model.chat import Message
 from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.prompts import Style, answers, plan_prompt, with_answer
+from proprio_mllm.model.prompts import Style, answers, critic_prompt, plan_prompt, with_answer
 from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
 from proprio_mllm.training.exercises import Exchange, is_symbolic
 
-__all__ = ["Clips", "Demos", "Exercises", "Views", "held_out", "shard_hash"]
+__all__ = ["Clips", "Demos", "Exercises", "Judgements", "Views", "held_out", "shard_hash"]
 
 #: One in this many views, episodes and clips is never trained on.
 HELD_OUT = 20
@@ -280,6 +280,21 @@ class Exercises:
     def target(self, index: int) -> str:
         """The right step."""
         return str(self.reader[int(index)]["target"])
+
+
+class Judgements:
+    """Questions in text alone whether an instruction was carried out (`sim.paper_world`)."""
+
+    def __init__(self, folder: Path, cfg: ModelConfig) -> None:
+        self.reader = ShardReader(folder, "judgements")
+        self._cfg = cfg
+
+    def draw(self, rng: np.random.Generator) -> Example:
+        """A conversation with its answer."""
+        row = self.reader[int(rng.integers(len(self.reader)))]
+        history = [HistoryItem(item["step"], item["feedback"]) for item in row["history"]]
+        prompt = critic_prompt(row["instruction"], row["visible"], history, None, self._cfg.prompt)
+        return Example(with_answer([replace(message, images=0) for message in prompt], row["target"]))
 
 
 class Clips:

@@ -134,7 +134,7 @@ def test_perturbed_steps_are_legal_and_differ(step):
 
 def test_arguments_are_read_and_wrong_ones_refused(capsys):
     assert parse(["kind=views", "out=x", "count=3", "robots=[x1]"]).robots == ("x1",)
-    with pytest.raises(ConfigError, match="views, demos, exercises"):
+    with pytest.raises(ConfigError, match="views, demos, exercises, judgements"):
         parse(["kind=pictures", "out=x", "count=3"])
     with pytest.raises(ConfigError, match="'count' is not key=value"):
         parse(["count"])

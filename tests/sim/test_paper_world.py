@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import pytest
@@ -49,6 +50,20 @@ def test_steps_name_known_objects_and_follow_from_the_log(episodes: list[Exercis
             last = row["history"][-1]["step"]
             assert last != row["target"]
     assert heights > 20
+
+
+def test_judgements_are_balanced_and_true(episodes: list[Exercise]) -> None:
+    rows = rows_of_part(dataclasses.replace(CONFIG, kind="judgements"), 0)
+    assert len(rows) == 300
+    assert 0.4 < sum(row["target"] == "yes" for row in rows) / len(rows) < 0.6
+    for episode, row in zip(episodes, rows, strict=True):
+        ends = episode.moments[-1].columns
+        if row["target"] == "yes":
+            assert episode.success
+            assert row["instruction"] == ends["instruction"]
+            assert row["history"] == ends["history"]
+        else:
+            assert not episode.success or row["step"] < ends["step"] or row["instruction"] != ends["instruction"]
 
 
 def test_what_is_held_already_is_not_picked_again(episodes: list[Exercise]) -> None:

@@ -142,7 +142,7 @@ def write_demos(folder: Path, episodes: int = 40) -> Path:
     return folder
 
 
-def write_exercises(folder: Path, episodes: int = 30) -> Path:
+def write_exercises(folder: Path, kind: str = "exercises", episodes: int = 30) -> Path:
     rows = []
     for episode in range(episodes):
         target = f"{TYPES[episode % len(TYPES)]}_1"
@@ -158,10 +158,10 @@ def write_exercises(folder: Path, episodes: int = 30) -> Path:
                     "visible": [target],
                     "known": [target, "CoffeeTable_2"],
                     "history": [{"step": "MoveAhead(0.1)", "feedback": "MoveAhead(0.1) ok"}] * step,
-                    "target": text,
+                    "target": text if kind == "exercises" else ("no", "yes")[step == len(PLAN) - 1],
                 }
             )
-    writer = ShardWriter(folder, "exercises", "test")
+    writer = ShardWriter(folder, kind, "test")
     writer.write(0, rows)
     writer.finish({})
     return folder
@@ -210,6 +210,7 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_views(root / "views", 60)
     write_demos(root / "demos")
     write_exercises(root / "exercises")
+    write_exercises(root / "judgements", "judgements")
     write_clips(root / "clips")
     return root
 

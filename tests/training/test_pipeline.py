@@ -191,14 +191,15 @@ def test_a_phase_changes_only_its_groups(trained: Pipeline, phase: str) -> None:
     from proprio_mllm.model.groups import group_of
     from proprio_mllm.model.motion_tokenizer import MotionTokenizer
     from proprio_mllm.training.alignment import AlignmentData
-    from proprio_mllm.training.sources import Clips, Exercises, Views
+    from proprio_mllm.training.sources import Clips, Exercises, Judgements, Views
 
     model = trained._start_alignment()
     shards, cfg = trained.paths.shards, trained.cfg.alignment
     tokenizer = MotionTokenizer.load(trained.paths.model("tokenizer"))
     views, demos = Views(shards("views"), model.cfg), Demos(shards("demos"), model.cfg)
     exercises = Exercises(shards("exercises"), model.cfg, demos)
-    data = AlignmentData(model, tokenizer, Clips(shards("clips")), views, demos, exercises, cfg)
+    judgements = Judgements(shards("judgements"), model.cfg)
+    data = AlignmentData(model, tokenizer, Clips(shards("clips")), views, demos, exercises, judgements, cfg)
     train_only(model, PHASES[phase].groups)
     before = {name: tensor.detach().clone() for name, tensor in model.named_parameters()}
     trained.loop(AlignmentObjective(model, data, phase, cfg, "test"), cfg.joint, trained.paths.root / f"groups-{phase}")
@@ -239,7 +240,7 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
     assert list(about["stages"]) == ["base", "corrections", "pointmap", "tokenizer", "alignment", "selu"]
     assert all(stage["command"] == "python train.py stage=all" and stage["metrics"] for stage in about["stages"].values())
-    assert set(about["shards"]) == {"clips", "views", "exercises", "demos", "corrections"}
+    assert set(about["shards"]) == {"clips", "views", "exercises", "judgements", "demos", "corrections"}
     ours, released = load_model(trained.paths.model("selu")), load_model(tmp_path / "tiny" / "full")
     theirs = dict(released.named_parameters())
     assert all(tensor.dtype == torch.float32 for tensor in theirs.values())
