@@ -22,7 +22,7 @@ def _list(of: Any) -> Any:
     return datasets.List(of)
 
 
-#: A planning prompt without a picture, and its answer.
+#: A planning prompt without a picture, the ids that its instruction names, and its answer.
 _IN_WORDS: Final[Mapping[str, Any]] = {
     "instruction": _TEXT,
     "robot": _TEXT,
@@ -32,6 +32,7 @@ _IN_WORDS: Final[Mapping[str, Any]] = {
     "visible": _list(_TEXT),
     "known": _list(_TEXT),
     "history": _list({"step": _TEXT, "feedback": _TEXT}),
+    "named": _list(_TEXT),
     "target": _TEXT,
 }
 #: Columns of each kind. Motions are flat (T·F,) float32; `decode_motion` restores them.

@@ -32,7 +32,7 @@ __all__ = ["collect", "main", "parts_of", "rows_of_part"]
 _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.
-_VERSION = {"views": 2, "demos": 3, "exercises": 1, "judgements": 1}
+_VERSION = {"views": 2, "demos": 3, "exercises": 2, "judgements": 2}
 #: Fields that do not change what is written.
 _UNKEYED = {
     "views": ("out", "workers", "noise", "medium_share"),

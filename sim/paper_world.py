@@ -119,6 +119,7 @@ def play(config: CollectConfig, index: int) -> Exercise:
                 "visible": list(world.visible),
                 "known": world.known(),
                 "history": history[-_HISTORY:],
+                "named": list(draft.focus.values()),
             }
         )
 
@@ -164,7 +165,8 @@ def judgement(config: CollectConfig, index: int) -> dict[str, Any]:
     if rng.random() < 0.2:
         other, scene = _draft(config, rng)
         instruction = other.sentences(scene.furniture, rng)[0]
-        return end.row("no" if instruction != end.columns["instruction"] else "yes", instruction)
+        row = end.row("no" if instruction != end.columns["instruction"] else "yes", instruction)
+        return row | {"named": list(other.focus.values())}
     earlier = exercise.moments[:-1]
     if not earlier:
         return end.row("yes")

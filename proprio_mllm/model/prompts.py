@@ -24,6 +24,7 @@ __all__ = [
     "filled_motion",
     "looking",
     "made_motion",
+    "named_prompt",
     "plan_prompt",
     "self_ask_prompt",
     "with_answer",
@@ -178,6 +179,20 @@ def critic_prompt(
             f'Was the goal "{goal}" completed? Answer yes or no.'
         )
     return (_system("judge", style), Message("user", text, images=1))
+
+
+def named_prompt(instruction: str, visible: Sequence[str], known: Sequence[str], style: Style = "terse") -> tuple[Message, ...]:
+    """Which objects does an instruction name? The reply lists ids as `answers` writes them, in the task's order."""
+    seen = set(visible)
+    other = [name for name in known if name not in seen]
+    if style == "terse":
+        text = f"{instruction}\nsee {_ids(visible, style)}\nknow {_ids(other, style)}\nnamed?"
+    else:
+        text = (
+            f"Task: {instruction}\nIn view: {_ids(visible, style)}\nKnown elsewhere: {_ids(other, style)}\n"
+            f"Which objects does the task name? List their ids."
+        )
+    return (_system("judge", style), Message("user", text))
 
 
 def self_ask_prompt(

@@ -7,75 +7,22 @@ read its inputs only.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action, ActionError, HistoryItem
+from data.records import HistoryItem
 from proprio_mllm.model.batch import Example
 from proprio_mllm.model.prompts import answers, critic_prompt, self_ask_prompt, with_answer
 from proprio_mllm.training.sources import Demos
+from proprio_mllm.training.states import states_from_log
 
-__all__ = ["LOG_LENGTH", "judge_example", "states_from_log"]
+__all__ = ["LOG_LENGTH", "judge_example"]
 
 #: Earlier steps shown to a judge.
 LOG_LENGTH: Final = 8
-_SWITCHES: Final = {"Open": "open", "Close": "closed", "ToggleOn": "switched on", "ToggleOff": "switched off", "Lift": "lifted"}
-_OPPOSITE: Final = {"open": "closed", "closed": "open", "switched on": "switched off", "switched off": "switched on"}
-
-
-def states_from_log(history: Sequence[HistoryItem]) -> dict[str, tuple[str, ...]]:
-    """Objects in each relation according to the successful actions of a log.
-
-    Relations: `held`, `lifted`, `open`, `closed`, `switched on`, `switched off`, and `on R` for receptacles R.
-    """
-    hands: dict[str, str] = {}
-    lifted = ""
-    found: dict[str, list[str]] = {name: [] for name in _SWITCHES.values()}
-
-    def move(thing: str, place: str | None) -> None:
-        for name, things in found.items():
-            if name.startswith("on ") and thing in things:
-                things.remove(thing)
-        if place is not None:
-            found.setdefault(f"on {place}", []).append(thing)
-
-    for item in history:
-        for part in item.feedback.split(";"):
-            text, _, result = part.strip().rpartition(" ")
-            try:
-                action = Action.parse(text)
-            except ActionError:
-                continue
-            thing = action.object_id or ""
-            if result != "ok":
-                continue
-            if action.name == "Pick" and action.arm is not None:
-                hands[action.arm.value] = thing
-                move(thing, None)
-            elif action.name == "Place" and action.arm is not None:
-                held = hands.pop(action.arm.value, None)
-                if held:
-                    move(held, thing)
-            elif action.name == "PlaceBoth":
-                if lifted:
-                    move(lifted, thing)
-                    found["lifted"] = []
-                lifted = ""
-            elif action.name in _SWITCHES:
-                relation = _SWITCHES[action.name]
-                if action.name == "Lift":
-                    lifted = thing
-                    move(thing, None)
-                opposite = found.get(_OPPOSITE.get(relation, ""), [])
-                if thing in opposite:
-                    opposite.remove(thing)
-                if thing not in found[relation]:
-                    found[relation].append(thing)
-    found["held"] = list(hands.values())
-    return {name: tuple(things) for name, things in found.items()}
 
 
 def judge_example(demos: Demos, index: int, rng: np.random.Generator, tokens: NDArray[np.int64] | None) -> Example:

@@ -27,9 +27,10 @@ from proprio_mllm.model.batch import Example, View
 from proprio_mllm.model.chat import Message
 from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.prompts import Style, answers, critic_prompt, plan_prompt, with_answer
+from proprio_mllm.model.prompts import Style, answers, critic_prompt, named_prompt, plan_prompt, self_ask_prompt, with_answer
 from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
 from proprio_mllm.training.exercises import Exchange, is_symbolic
+from proprio_mllm.training.states import states_from_log
 
 __all__ = ["Clips", "Demos", "Exercises", "Judgements", "Views", "held_out", "shard_hash"]
 
@@ -37,8 +38,9 @@ __all__ = ["Clips", "Demos", "Exercises", "Judgements", "Views", "held_out", "sh
 HELD_OUT = 20
 GROUNDING = ("side", "distance", "height")
 BODY_RELATIVE = ("arm", "shift")
-#: Share of exercises that are the expert's own logs with names exchanged; the others come from the exercises' shards.
-FROM_LOGS = 0.25
+#: Shares of exercises: the expert's own logs with names exchanged, which objects an instruction names, which objects are in a
+#: state according to the log. The others ask for the next step of an episode in words.
+FROM_LOGS, NAMING, STATES = 0.2, 0.2, 0.1
 
 
 def held_out(key: str) -> bool:
@@ -267,9 +269,30 @@ class Exercises:
 
     def draw(self, rng: np.random.Generator) -> Example:
         """A training example."""
-        if rng.random() < FROM_LOGS:
+        kind = rng.random()
+        if kind < FROM_LOGS:
             return self._demos.exercise(rng)
-        return self.example(int(rng.integers(self._train)))
+        index = int(rng.integers(self._train))
+        if kind < FROM_LOGS + NAMING:
+            return self._naming(index)
+        if kind < FROM_LOGS + NAMING + STATES:
+            return self._state(index, rng)
+        return self.example(index)
+
+    def _naming(self, index: int) -> Example:
+        row = self.reader[index]
+        prompt = named_prompt(row["instruction"], row["visible"], row["known"], self._cfg.prompt)
+        return Example(with_answer(prompt, answers(row["named"])))
+
+    def _state(self, index: int, rng: np.random.Generator) -> Example:
+        row = self.reader[index]
+        history = [HistoryItem(item["step"], item["feedback"]) for item in row["history"]]
+        states = states_from_log(history)
+        full = [name for name, things in states.items() if things]
+        names = full if full and rng.random() < 0.7 else sorted(states)
+        relation = names[int(rng.integers(len(names)))]
+        prompt = self_ask_prompt(relation, row["visible"], history, None, self._cfg.prompt)
+        return Example(with_answer([replace(message, images=0) for message in prompt], answers(states[relation])))
 
     def example(self, index: int, answered: bool = True) -> Example:
         """One row's conversation."""

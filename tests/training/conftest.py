@@ -158,6 +158,7 @@ def write_exercises(folder: Path, kind: str = "exercises", episodes: int = 30) -
                     "visible": [target],
                     "known": [target, "CoffeeTable_2"],
                     "history": [{"step": "MoveAhead(0.1)", "feedback": "MoveAhead(0.1) ok"}] * step,
+                    "named": [target],
                     "target": text if kind == "exercises" else ("no", "yes")[step == len(PLAN) - 1],
                 }
             )

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from configs.schema.model import ModelConfig
 from proprio_mllm.training.exercises import GROUPS, Exchange, is_symbolic
+from proprio_mllm.training.sources import Demos, Exercises
 from sim.tasks.instructions import natural_name
 
 ROW = {
@@ -66,3 +69,15 @@ def test_a_drawn_exchange_is_one_to_one() -> None:
 )
 def test_steps_that_depend_on_the_scene_are_left_out(step: str, symbolic: bool) -> None:
     assert is_symbolic(step) is symbolic
+
+
+def test_exercises_in_words_ask_for_steps_names_and_states(shards: Path, cfg: ModelConfig) -> None:
+    exercises = Exercises(shards / "exercises", cfg, Demos(shards / "demos", cfg))
+    rng = np.random.default_rng(0)
+    drawn = [exercises.draw(rng) for _ in range(120)]
+    assert not any(example.views for example in drawn)
+    endings = [example.messages[-2].text.splitlines()[-1].split(" ")[0] for example in drawn]
+    assert 10 < endings.count("named?") < 40
+    assert 3 < endings.count("which") < 30
+    named = next(example for example, ending in zip(drawn, endings, strict=True) if ending == "named?")
+    assert named.messages[-1].text.endswith("_1")

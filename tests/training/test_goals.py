@@ -6,7 +6,7 @@ import pytest
 
 from data.records import HistoryItem
 from proprio_mllm.training.goals import natural_name, parse_ids, relabel, verbs_of
-from proprio_mllm.training.judging import states_from_log
+from proprio_mllm.training.states import states_from_log
 
 INVENTORY = ("Mug_1", "Plate_1", "CoffeeTable_1", "Fridge_1", "Lamp_1", "Lamp_2")
 
