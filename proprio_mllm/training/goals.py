@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["VERBS", "Relabel", "Verb", "natural_name", "parse_ids", "relabel", "verbs_of"]
+__all__ = ["VERBS", "Relabel", "Verb", "natural_name", "parse_ids", "relabel", "type_words", "verbs_of"]
 
 _OBJECT_ID = re.compile(r"^[A-Za-z][A-Za-z0-9]{0,39}_[1-9][0-9]?$")
 _WORDS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|[0-9]+")
@@ -73,8 +73,13 @@ def verbs_of(instruction: str) -> tuple[str, ...]:
 
 def natural_name(object_id: str) -> str:
     """`CoffeeTable_1` as `the coffee table`."""
-    words = _WORDS.findall(object_id.rpartition("_")[0])
-    return "the " + " ".join(word if word.isupper() and len(word) > 1 else word.lower() for word in words)
+    return f"the {type_words(object_id.rpartition('_')[0])}"
+
+
+def type_words(object_type: str) -> str:
+    """`CoffeeTable` as `coffee table`."""
+    words = _WORDS.findall(object_type)
+    return " ".join(word if word.isupper() and len(word) > 1 else word.lower() for word in words)
 
 
 def parse_ids(reply: str, inventory: Sequence[str]) -> tuple[str, ...]:

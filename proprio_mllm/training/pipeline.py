@@ -34,7 +34,7 @@ from proprio_mllm.training.motion_stage import MotionObjective, MotionWindows, t
 from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_key
 from proprio_mllm.training.rollouts import CorrectionRequest
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Judgements, Views, shard_hash
-from proprio_mllm.training.text import corpus, whole_words
+from proprio_mllm.training.text import corpus, start_from_words, whole_words
 
 __all__ = ["NEEDS", "STAGES", "Pipeline", "StageError", "variant_model"]
 
@@ -173,14 +173,15 @@ class Pipeline:
             return {}
         views, demos = Views(self.paths.shards("views"), plain), Demos(self.paths.shards("demos"), plain)
         clips = Clips(self.paths.shards("clips"))
-        processor = build_processor(plain, corpus(plain, views, demos, clips, cfg.seed), whole_words(views))
-        model = build_model(plain, processor, cfg.seed)
+        exercises = Exercises(self.paths.shards("exercises"), plain, demos)
+        texts = corpus(plain, views, demos, exercises, clips, cfg.seed)
+        model = build_model(plain, build_processor(plain, texts, whole_words(views)), cfg.seed)
+        start_from_words(model, views.type_names)
         head = DenseHead(model, views.type_names)
         model.requires_grad_(True)
         dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
         self._train_dense(dense, model, head, folder / "dense")
         model.requires_grad_(True)
-        exercises = Exercises(self.paths.shards("exercises"), plain, demos)
         joint = JointObjective(model, head, views, demos, exercises, cfg.base, f"{key}/joint")
         self.loop(joint, cfg.base.joint, folder / "joint")
         save_model(model.eval(), self.paths.model("base"))

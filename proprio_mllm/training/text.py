@@ -1,25 +1,34 @@
-"""The text that the tiny tokenizer is trained on: the project's own prompts, answers and captions, from the shards."""
+"""What the tiny model starts from: the text that its tokenizer is trained on, and rows of type names that mean their words."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+import torch
 
 from configs.schema.model import ModelConfig
 from data.records import ACTIONS
 from proprio_mllm.model.chat import render
+from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import critic_prompt, looking, self_ask_prompt
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views
+from proprio_mllm.training.goals import type_words
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Views
 
-__all__ = ["corpus", "whole_words"]
+__all__ = ["corpus", "start_from_words", "whole_words"]
 
 
-def corpus(cfg: ModelConfig, views: Views, demos: Demos, clips: Clips, seed: int = 0, limit: int = 4000) -> list[str]:
+def corpus(
+    cfg: ModelConfig, views: Views, demos: Demos, exercises: Exercises, clips: Clips, seed: int = 0, limit: int = 4000
+) -> list[str]:
     """Texts of every kind that the model will read or write.
 
     Args:
         cfg: prompt style.
         views: shards.
         demos: shards.
+        exercises: shards.
         clips: shards.
         seed: of the choice of rows.
         limit: rows per kind.
@@ -29,6 +38,7 @@ def corpus(cfg: ModelConfig, views: Views, demos: Demos, clips: Clips, seed: int
     for index in _some(demos.split.train, limit, rng):
         example = demos.example(int(index), None)
         texts.append(render(example.messages))
+    texts.extend(render(exercises.draw(rng).messages) for _ in range(limit))
     for index in _some(views.split.train, limit // 4, rng):
         row = views.row(int(index))
         pairs = [views.listing(row), *views.pairs(row, (*GROUNDING, *BODY_RELATIVE), 10, rng)]
@@ -41,6 +51,30 @@ def corpus(cfg: ModelConfig, views: Views, demos: Demos, clips: Clips, seed: int
 def whole_words(views: Views) -> list[str]:
     """Words that get a token of their own: object types and action names."""
     return [*views.type_names, *ACTIONS]
+
+
+@torch.no_grad()
+def start_from_words(model: ProprioMLLM, names: Sequence[str]) -> None:
+    """Lets the embedding of each type name start as that of its words: `PaperTowelRoll` as ` paper towel roll`.
+
+    What an instruction calls a thing and the thing's id then resemble each other before any training, as the two do in a
+    pretrained model. The sum over n words is divided by √n, which keeps the scale of a fresh row.
+
+    Args:
+        model: with fresh weights.
+        names: object types, each a token of its own.
+
+    Raises:
+        ValueError: when a name is not one token.
+    """
+    embeddings: Any = model.core.get_input_embeddings()
+    tokenizer, rows = model.processor.tokenizer, embeddings.weight
+    for name in names:
+        own = tokenizer(name, add_special_tokens=False).input_ids
+        if len(own) != 1:
+            raise ValueError(f"type {name!r} is {len(own)} tokens; it must be one")
+        words = tokenizer(f" {type_words(name)}", add_special_tokens=False).input_ids
+        rows[own[0]] = rows[words].sum(0) / len(words) ** 0.5
 
 
 def _some(indices: np.ndarray, limit: int, rng: np.random.Generator) -> np.ndarray:

@@ -1,0 +1,51 @@
+"""What the tiny model starts from: a tokenizer of the project's own text, and type names that mean their words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from configs.schema.model import ModelConfig
+from proprio_mllm.model.building import build_model, build_processor
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.training.sources import Clips, Demos, Exercises, Views
+from proprio_mllm.training.text import corpus, start_from_words, whole_words
+
+
+@pytest.fixture
+def fresh(shards: Path, cfg: ModelConfig) -> ProprioMLLM:
+    views, demos = Views(shards / "views", cfg), Demos(shards / "demos", cfg)
+    exercises = Exercises(shards / "exercises", cfg, demos)
+    texts = corpus(cfg, views, demos, exercises, Clips(shards / "clips"))
+    return build_model(cfg, build_processor(cfg, texts, whole_words(views)))
+
+
+def row(model: ProprioMLLM, text: str) -> torch.Tensor:
+    ids = model.processor.tokenizer(text, add_special_tokens=False).input_ids
+    return model.core.get_input_embeddings().weight.detach()[ids].sum(0)
+
+
+def test_the_corpus_holds_every_kind_of_text(shards: Path, cfg: ModelConfig) -> None:
+    views, demos = Views(shards / "views", cfg), Demos(shards / "demos", cfg)
+    texts = "\n".join(corpus(cfg, views, demos, Exercises(shards / "exercises", cfg, demos), Clips(shards / "clips")))
+    for wanted in ("named?", "which ", "plan", "judge", "left"):
+        assert wanted in texts, wanted
+
+
+def test_a_type_name_starts_as_its_words(fresh: ProprioMLLM) -> None:
+    others = row(fresh, "Mug")
+    start_from_words(fresh, ("CoffeeTable", "Fridge"))
+    coffee_table = row(fresh, "CoffeeTable")
+    words = fresh.processor.tokenizer(" coffee table", add_special_tokens=False).input_ids
+    assert torch.allclose(coffee_table * len(words) ** 0.5, row(fresh, " coffee table"), atol=1e-6)
+    similar = torch.cosine_similarity
+    assert similar(coffee_table, row(fresh, " coffee table"), 0) > 0.99
+    assert similar(coffee_table, row(fresh, " lamp"), 0) < 0.5
+    assert torch.equal(others, row(fresh, "Mug"))
+
+
+def test_a_name_of_several_tokens_is_refused(fresh: ProprioMLLM) -> None:
+    with pytest.raises(ValueError, match="'SpaceRocketLauncher'"):
+        start_from_words(fresh, ("SpaceRocketLauncher",))
