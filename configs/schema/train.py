@@ -118,6 +118,11 @@ class AlignmentConfig:
     questions: int = 6
     mask: float = 0.3
 
+    def __post_init__(self) -> None:
+        for name in ("plan_share", "exercise_share", "judge_share", "mask"):
+            _require(0.0 <= getattr(self, name) <= 1.0, f"{name} {getattr(self, name)} outside [0, 1]")
+        _require(self.questions > 0, f"questions {self.questions} must be positive")
+
 
 @dataclass(frozen=True)
 class SeluConfig:

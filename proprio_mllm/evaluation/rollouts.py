@@ -79,8 +79,9 @@ def collect_rollouts(
         planner = PlannerConfig("actor", "mllm", "Actor", str(request.model), temperature=request.temperature)
         setup = WorkerSetup(planner, difficulty, "fixed")
         make = functools.partial(EpisodeWorker, setup) if opener is None else functools.partial(EpisodeWorker, setup, opener)
-        broken = _run_parts(writer, parts, make, min(workers, os.cpu_count() or 1), len(jobs))
-        writer.finish({"actor": str(request.model), "temperature": request.temperature, "infrastructure_errors": broken})
+        _run_parts(writer, parts, make, min(workers, os.cpu_count() or 1), len(jobs))
+    if not writer.manifest.complete:
+        writer.finish({"actor": str(request.model), "temperature": request.temperature})
 
 
 def _run_parts(
@@ -89,13 +90,13 @@ def _run_parts(
     make: functools.partial[EpisodeWorker],
     workers: int,
     total: int,
-) -> int:
-    """Writes every part as soon as its last episode ends; returns how many episodes broke and are left out."""
+) -> None:
+    """Writes every part as soon as its last episode ends, and notes how many episodes broke and are left out."""
     owner = {_name(job.fields): index for index, jobs in parts.items() for job in jobs}
     left = {index: len(jobs) for index, jobs in parts.items()}
     rows: dict[int, list[dict[str, Any]]] = {index: [] for index in parts}
     queue = [job for jobs in parts.values() for job in jobs]
-    broken = 0
+    broken = dict.fromkeys(parts, 0)
     with tqdm(total=total, initial=total - len(queue), desc="rollouts", unit="episode") as bar:
         for result in run_jobs(make, queue, workers, _never, lost_episode):
             bar.update(1)
@@ -103,13 +104,14 @@ def _run_parts(
             index = owner[record.task, record.robot, record.trial]
             left[index] -= 1
             if result.rollout is None:
-                broken += 1
+                broken[index] += 1
                 logger.warning("rollout of %s broke: %s", record.task, record.message[-300:])
             else:
                 rows[index].append(dict(result.rollout))
             if not left[index]:
+                earlier = int(writer.manifest.metadata.get("infrastructure_errors", 0))
+                writer.annotate({"infrastructure_errors": earlier + broken[index]})
                 writer.write(index, sorted(rows.pop(index), key=lambda row: row["episode"]))
-    return broken
 
 
 def _jobs(

@@ -48,6 +48,7 @@ def test_every_yaml_composes(path: Path) -> None:
         ("eval", "planner=oracle", r"planner='oracle' is not allowed; allowed: base, expert"),
         ("eval", "robot=atlas", r"robot='atlas' is not allowed; allowed: h1, x1"),
         ("eval", "trials=0", r"trials 0 must be positive"),
+        ("train", "alignment.mask=1.5", r"mask 1\.5 outside \[0, 1\]"),
         ("eval", "trials", r"override 'trials': expected key=value"),
         ("eval", "planner.colour=red", r"planner\.colour: unknown key"),
     ],

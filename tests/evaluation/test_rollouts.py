@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
+from data.shards import Manifest
 from proprio_mllm.evaluation import worker as worker_module
 from proprio_mllm.evaluation.rollouts import collect_rollouts
 from proprio_mllm.training.rollouts import RolloutRequest, read_rollouts
@@ -44,6 +47,12 @@ def test_a_broken_episode_is_left_out_and_a_complete_folder_is_kept(request_, se
     assert len(read_rollouts(request_.folder)) == 4
     collect_rollouts(request_, tasks, workers=0, opener=opener)
     assert len(calls) == 5
+    manifest = Manifest.load(request_.folder)
+    assert manifest.metadata["infrastructure_errors"] == 1
+    dataclasses.replace(manifest, complete=False).save(request_.folder)  # killed after the last part
+    collect_rollouts(request_, tasks, workers=0, opener=opener)
+    assert len(calls) == 5
+    assert Manifest.load(request_.folder) == manifest
 
 
 def test_refuses_benchmark_tasks_and_zero_temperature(request_, task) -> None:
