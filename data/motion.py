@@ -27,6 +27,7 @@ __all__ = [
     "HAND_OPENING",
     "KEY_BODY_COUNT",
     "N_FEATURES",
+    "OPEN_HAND",
     "PELVIS_HEIGHT",
     "PLANAR_VELOCITY",
     "YAW_RATE",
@@ -59,6 +60,8 @@ PELVIS_HEIGHT: Final = 3 * KEY_BODY_COUNT
 PLANAR_VELOCITY: Final = slice(PELVIS_HEIGHT + 1, PELVIS_HEIGHT + 3)
 YAW_RATE: Final = PELVIS_HEIGHT + 3
 HAND_OPENING: Final = slice(PELVIS_HEIGHT + 4, PELVIS_HEIGHT + 6)
+#: Opening from which on a hand counts as open; what it holds keeps it below.
+OPEN_HAND: Final = 0.97
 
 
 def wrap_angle(angle_rad: ArrayLike) -> NDArray[np.float64]:

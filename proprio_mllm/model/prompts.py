@@ -21,6 +21,7 @@ __all__ = [
     "answers",
     "critic_prompt",
     "described_motion",
+    "felt_body",
     "filled_motion",
     "looking",
     "made_motion",
@@ -148,6 +149,24 @@ def described_motion(motion: Sequence[int], caption: str, image: bool = False, s
     """Motion to text, with or without the view at the motion's end."""
     ask = "say " if style == "terse" else "Describe this motion: "
     return with_answer((_system("move", style), Message("user", f"{ask}{motion_text(motion)}", images=int(image))), caption)
+
+
+def felt_body(motion: Sequence[int], hands: str, height: str, style: Style = "terse") -> tuple[Message, ...]:
+    """Motion to the body's state at its end: which hands are open, and how high the pelvis is.
+
+    Args:
+        motion: motion tokens.
+        hands: `left right`, `left`, `right` or `none`.
+        height: metres, such as `0.85`; empty leaves the conversation open for generation, as an empty `hands` does before it.
+        style: terse or full.
+    """
+    terse = style == "terse"
+    open_hands = f"{motion_text(motion)}open" if terse else f"{_body(motion, style)}Which of your hands are open?"
+    messages = [_system("move", style), Message("user", open_hands)]
+    if hands:
+        question = "height" if terse else "How high is your pelvis, in metres?"
+        messages += [Message("assistant", hands), Message("user", question)]
+    return with_answer(messages, height) if height else tuple(messages)
 
 
 def made_motion(caption: str, motion: Sequence[int], style: Style = "terse") -> tuple[Message, ...]:

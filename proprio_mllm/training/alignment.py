@@ -2,15 +2,16 @@
 
 | phase | pairs | trains | frozen |
 |---|---|---|---|
-| text (2a-i) | motion to text, text to motion, masked motion | motion rows, LoRA | vision, merger, CSE |
+| text (2a-i) | motion to text, motion to body state, text to motion, masked motion | motion rows, LoRA | vision, merger, CSE |
 | image (2a-ii) | motion and image to text | motion rows, CSE, MPE | language model's LoRA, vision |
 | joint (2b) | all of them | motion rows, LoRA, CSE, MPE, merger | vision, backbone |
 
-"Freeze the image and text weights separately" leaves open which weights; this reading freezes one modality's while the other's
-pairs train. Besides clip captions, motion and image to text holds questions about the robot's own body in its scene (which arm
-reaches an object, how far the body must go down). A share of planning demonstrations, with motion tokens in the prompt, keeps
-the planner's format, and exercises in text alone keep what the base stage learnt from them; the paper does not
-mention any such replay. Corrections (`stage=corrections`) count as demonstrations here.
+"Freeze the image and text weights separately" leaves open which weights; this reading freezes one modality's while the
+other's pairs train. Besides clip captions, motion and image to text holds questions about the robot's own body in its scene
+(which arm reaches an object, how far the body must go down), and motion to text asks which hands are open and how high the
+pelvis is, which captions do not say and planning needs. A share of planning demonstrations, with motion tokens in the prompt,
+keeps the planner's format, and exercises in text alone keep what the base stage learnt from them; the paper does not mention
+any such replay. Corrections (`stage=corrections`) count as demonstrations here.
 
 The control `variant=no_proprio` has the joint phase alone, and of its pairs those that need no motion.
 """
@@ -27,16 +28,19 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from configs.schema.train import AlignmentConfig
+from data.motion import HAND_OPENING, OPEN_HAND, PELVIS_HEIGHT
 from proprio_mllm.model.batch import Batch, Collator, Example
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.prompts import Style, described_motion, filled_motion, looking, made_motion
+from proprio_mllm.model.prompts import Style, described_motion, felt_body, filled_motion, looking, made_motion
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Judgements, Views
 
-__all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Phase"]
+__all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Phase", "body_state", "body_state_accuracy"]
 
-Kind = Literal["say", "do", "fill", "say_image", "body", "plan", "exercise"]
+Kind = Literal["say", "feel", "do", "fill", "say_image", "body", "plan", "exercise"]
+#: Pelvis heights are said in multiples of this, metres.
+_HEIGHT_STEP_M: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +52,11 @@ class Phase:
 
 
 PHASES: Final[Mapping[str, Phase]] = {
-    "text": Phase(("rows", "lora"), ("say", "do", "fill")),
+    "text": Phase(("rows", "lora"), ("say", "feel", "do", "fill")),
     "image": Phase(("rows", "cse", "mpe"), ("say_image", "body")),
-    "joint": Phase(("rows", "lora", "cse", "mpe", "merger"), ("say", "do", "fill", "say_image", "body", "body", "plan")),
+    "joint": Phase(
+        ("rows", "lora", "cse", "mpe", "merger"), ("say", "feel", "feel", "do", "fill", "say_image", "body", "body", "plan")
+    ),
 }
 
 
@@ -74,6 +80,7 @@ class AlignmentData:
         self._style: Style = model.cfg.prompt
         self._proprioception = model.cfg.proprioception
         self._demo_tokens = demos.tokens(tokenizer) if self._proprioception else None
+        self._grips = _by_open_hands(demos)
         with_images = [i for i, images in enumerate(clips.reader.column("image_frames")) if images]
         self._pictured = np.intersect1d(np.asarray(with_images, dtype=np.int64), clips.split.train)
 
@@ -90,6 +97,9 @@ class AlignmentData:
             return self._collator([self._plan(int(i), rng) for i in rows])
         if kind == "body":
             return self._collator([self._body(int(i), rng) for i in rng.choice(self.views.split.train, size)])
+        if kind == "feel":
+            groups = rng.integers(len(self._grips), size=size)
+            return self._collator([self._feel(int(rng.choice(self._grips[g]))) for g in groups])
         if kind == "say_image":
             return self._collator([self._say_image(int(i), rng) for i in rng.choice(self._pictured, size)])
         frames = self.tokenizer.cfg.window
@@ -111,6 +121,10 @@ class AlignmentData:
         hidden = rng.random(len(codes)) < self._cfg.mask
         return Example(filled_motion([None if h else c for c, h in zip(codes, hidden, strict=True)], codes, self._style))
 
+    def _feel(self, index: int) -> Example:
+        assert self._demo_tokens is not None
+        return Example(felt_body(self._demo_tokens[index].tolist(), *body_state(self.demos.motions[index]), self._style))
+
     def _say_image(self, clip: int, rng: np.random.Generator) -> Example:
         view, motion = self.clips.view(clip, rng)
         codes = self.tokenizer.encode_window(motion)
@@ -123,6 +137,48 @@ class AlignmentData:
         pairs += self.views.pairs(row, GROUNDING, half, rng)
         codes = self.tokenizer.encode_window(row.motion) if self._proprioception else None
         return Example(looking(pairs or [self.views.listing(row)], codes, self._style), (row.view,))
+
+
+def body_state(motion: NDArray[np.floating]) -> tuple[str, str]:
+    """Which hands are open at the end of a window (T, F), and the pelvis' height in metres, in words."""
+    hands = [name for name, opening in zip(("left", "right"), motion[-1, HAND_OPENING], strict=True) if opening >= OPEN_HAND]
+    steps = round(float(motion[-1, PELVIS_HEIGHT]) / _HEIGHT_STEP_M)
+    return " ".join(hands) or "none", f"{steps * _HEIGHT_STEP_M:.2f}"
+
+
+def _by_open_hands(demos: Demos) -> list[NDArray[np.int64]]:
+    """Training rows with the same hands open; drawing each set as often shows full hands as often as empty ones."""
+    opened = demos.motions[demos.split.train, -1, HAND_OPENING] >= OPEN_HAND  # (N, 2)
+    groups = [demos.split.train[(opened == state).all(axis=1)] for state in ([0, 0], [0, 1], [1, 0], [1, 1])]
+    return [group for group in groups if len(group)]
+
+
+@torch.no_grad()
+def body_state_accuracy(model: ProprioMLLM, demos: Demos, tokens: MotionTokenizer, limit: int = 200) -> dict[str, float]:
+    """Share of held-out windows whose open hands and pelvis height the model says rightly, with the commonest answer's share.
+
+    The height is asked after the right answer about the hands.
+    """
+    collator = Collator(model.processor, model.cfg)
+    codes = demos.tokens(tokens)
+    rows = [int(i) for i in demos.split.test[:limit]]
+    truth = [body_state(demos.motions[i]) for i in rows]
+    result: dict[str, float] = {}
+    for part, name in enumerate(("hands", "pelvis")):
+        right = 0
+        for start in range(0, len(rows), 16):
+            chunk = range(start, min(start + 16, len(rows)))
+            told = [truth[k][0] if part else "" for k in chunk]
+            asked = [
+                Example(felt_body(codes[rows[k]].tolist(), hands, "", model.cfg.prompt))
+                for k, hands in zip(chunk, told, strict=True)
+            ]
+            replies = model.reply(collator(asked, generation=True).to(model.device), 10)
+            right += sum(reply.strip() == truth[k][part] for reply, k in zip(replies, chunk, strict=True))
+        answers = [answer[part] for answer in truth]
+        result[f"{name}_accuracy"] = right / max(len(rows), 1)
+        result[f"{name}_majority"] = max((answers.count(a) for a in set(answers)), default=0) / max(len(rows), 1)
+    return result
 
 
 class AlignmentObjective:

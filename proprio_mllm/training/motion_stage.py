@@ -2,6 +2,10 @@
 
 The windows are what a planner encodes at run time; training on clips alone would leave them out of distribution. One tokenizer
 serves both robots.
+
+Of a frame's 48 numbers 42 are key bodies, so that a loss that weighs all alike gives up the two hand openings, which tell what
+the robot holds. `FEATURE_BIAS` lets single features count more, as the feature bias of HumanML3D's own normalisation does for
+the root and the foot contacts; the paper does not say how it normalises.
 """
 
 from __future__ import annotations
@@ -13,13 +17,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from data.motion import KEY_BODY_COUNT
+from data.motion import HAND_OPENING, KEY_BODY_COUNT, N_FEATURES, OPEN_HAND, PELVIS_HEIGHT
 from proprio_mllm.model.geometry import KEY_BODIES
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.sources import Clips, held_out
 
-__all__ = ["MotionObjective", "MotionWindows", "tokenizer_metrics"]
+__all__ = ["FEATURE_BIAS", "MotionObjective", "MotionWindows", "tokenizer_metrics"]
 
+#: Factor on each normalised feature (F,).
+FEATURE_BIAS = np.ones(N_FEATURES, dtype=np.float32)
+FEATURE_BIAS[PELVIS_HEIGHT] = 2.0
+FEATURE_BIAS[HAND_OPENING] = 5.0
 HANDS_AND_FEET = [i for i, name in enumerate(KEY_BODIES) if name.endswith(("hand", "ankle"))]
 
 
@@ -46,12 +54,12 @@ class MotionWindows:
         return np.stack(out)
 
     def statistics(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Mean and deviation (F,) over all training frames, clips and windows weighted alike."""
+        """Mean and deviation (F,) of all training frames, clips and windows weighted alike; deviations over `FEATURE_BIAS`."""
         clips = np.concatenate([self.clips.motions[int(i)] for i in self.clips.split.train])
         parts = [clips] if len(self.train) == 0 else [clips, self.train.reshape(-1, clips.shape[1])]
         mean = np.mean([part.mean(axis=0) for part in parts], axis=0)
         square = np.mean([((part - mean) ** 2).mean(axis=0) for part in parts], axis=0)
-        return mean.astype(np.float32), np.sqrt(square).astype(np.float32)
+        return mean.astype(np.float32), (np.sqrt(square) / FEATURE_BIAS).astype(np.float32)
 
 
 class MotionObjective:
@@ -81,7 +89,11 @@ class MotionObjective:
 
 @torch.no_grad()
 def tokenizer_metrics(tokenizer: MotionTokenizer, windows: MotionWindows, seed: int = 0) -> dict[str, float]:
-    """Reconstruction of held-out clips and windows: MPJPE and hand and foot error in mm, height error in mm, codes used."""
+    """Reconstruction of held-out clips and windows.
+
+    MPJPE, hand and foot error and height error in mm, the share of hands whose state at the end (open or not) survives, and the
+    share of codes that are used.
+    """
     rng = np.random.default_rng(seed)
     clips = [windows.clips.window(int(i), windows.frames, rng) for i in windows.clips.split.test for _ in range(4)]
     result: dict[str, float] = {}
@@ -98,6 +110,8 @@ def tokenizer_metrics(tokenizer: MotionTokenizer, windows: MotionWindows, seed: 
         result[f"{name}_mpjpe_mm"] = 1000.0 * float(error.mean())
         result[f"{name}_hands_feet_mm"] = 1000.0 * float(error[..., HANDS_AND_FEET].mean())
         result[f"{name}_height_mm"] = 1000.0 * float((rebuilt[..., keys] - truth[..., keys]).abs().mean())
+        hands = (rebuilt[:, -1, HAND_OPENING] >= OPEN_HAND) == (truth[:, -1, HAND_OPENING] >= OPEN_HAND)
+        result[f"{name}_hand_state"] = float(hands.double().mean())
         result[f"{name}_count"] = float(len(rows))
     sample = torch.from_numpy(windows.draw(rng, 512)).to(tokenizer.mean.device)
     counts = torch.bincount(tokenizer.encode(sample).flatten(), minlength=tokenizer.cfg.codes).double()

@@ -25,12 +25,12 @@ from proprio_mllm.model.dense import DenseHead
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective
+from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, body_state_accuracy
 from proprio_mllm.training.base import DenseObjective, JointObjective, exercise_accuracy, grounding_accuracy, plan_accuracy
 from proprio_mllm.training.geometry_stage import PointMapObjective, point_map_error
 from proprio_mllm.training.loop import Objective, run_loop
 from proprio_mllm.training.metrics import MetricWriter
-from proprio_mllm.training.motion_stage import MotionObjective, MotionWindows, tokenizer_metrics
+from proprio_mllm.training.motion_stage import FEATURE_BIAS, MotionObjective, MotionWindows, tokenizer_metrics
 from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_key
 from proprio_mllm.training.rollouts import CorrectionRequest
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Judgements, Views, shard_hash
@@ -114,7 +114,10 @@ class Pipeline:
             return stage_key(wanted, cfg.seed, {"views": shard_hash(shards("views"))})
         if name == "tokenizer":
             inputs = {kind: shard_hash(shards(kind)) for kind in ("clips", "views", "demos")}
-            wanted = {"loop": dataclasses.asdict(cfg.tokenizer), "motion": dataclasses.asdict(cfg.model.motion)}
+            wanted = {
+                "loop": dataclasses.asdict(cfg.tokenizer), "motion": dataclasses.asdict(cfg.model.motion),
+                "bias": FEATURE_BIAS.tolist(),
+            }  # fmt: skip
             return stage_key(wanted, cfg.seed, inputs)
         model = dataclasses.asdict(variant_model(cfg.model, cfg.variant))
         if name == "alignment":
@@ -277,7 +280,8 @@ class Pipeline:
         read = tokenizer if model.cfg.proprioception else None
         save_model(model.eval(), self.paths.model("alignment"), read)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
-        return {**asked, **plan_accuracy(model, demos, read), **exercise_accuracy(model, exercises)}
+        felt = body_state_accuracy(model, demos, read) if read is not None else {}
+        return {**asked, **felt, **plan_accuracy(model, demos, read), **exercise_accuracy(model, exercises)}
 
     def _selu(self, folder: Path, key: str) -> Metrics:
         from proprio_mllm.training.selu import run_selu
