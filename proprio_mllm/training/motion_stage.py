@@ -26,8 +26,8 @@ __all__ = ["FEATURE_BIAS", "MotionObjective", "MotionWindows", "tokenizer_metric
 
 #: Factor on each normalised feature (F,).
 FEATURE_BIAS = np.ones(N_FEATURES, dtype=np.float32)
-FEATURE_BIAS[PELVIS_HEIGHT] = 2.0
-FEATURE_BIAS[HAND_OPENING] = 5.0
+FEATURE_BIAS[PELVIS_HEIGHT] = 1.5
+FEATURE_BIAS[HAND_OPENING] = 3.0
 HANDS_AND_FEET = [i for i, name in enumerate(KEY_BODIES) if name.endswith(("hand", "ankle"))]
 
 
