@@ -145,23 +145,27 @@ def looking(
     return tuple(messages)
 
 
-def described_motion(motion: Sequence[int], caption: str, image: bool = False, style: Style = "terse") -> tuple[Message, ...]:
-    """Motion to text, with or without the view at the motion's end."""
+def described_motion(
+    motion: Sequence[int] | None, caption: str, image: bool = False, style: Style = "terse"
+) -> tuple[Message, ...]:
+    """Motion to text, with or without the view at the motion's end; None leaves the motion out, which teaches the words."""
     ask = "say " if style == "terse" else "Describe this motion: "
-    return with_answer((_system("move", style), Message("user", f"{ask}{motion_text(motion)}", images=int(image))), caption)
+    shown = "" if motion is None else motion_text(motion)
+    return with_answer((_system("move", style), Message("user", f"{ask}{shown}", images=int(image))), caption)
 
 
-def felt_body(motion: Sequence[int], hands: str, height: str, style: Style = "terse") -> tuple[Message, ...]:
+def felt_body(motion: Sequence[int] | str, hands: str, height: str, style: Style = "terse") -> tuple[Message, ...]:
     """Motion to the body's state at its end: which hands are open, and how high the pelvis is.
 
     Args:
-        motion: motion tokens.
+        motion: motion tokens, or words that say the same.
         hands: `left right`, `left`, `right` or `none`.
         height: metres, such as `0.85`; empty leaves the conversation open for generation, as an empty `hands` does before it.
         style: terse or full.
     """
     terse = style == "terse"
-    open_hands = f"{motion_text(motion)}open" if terse else f"{_body(motion, style)}Which of your hands are open?"
+    shown = f"{motion}\n" if isinstance(motion, str) else _body(motion, style)
+    open_hands = f"{shown}open" if terse else f"{shown}Which of your hands are open?"
     messages = [_system("move", style), Message("user", open_hands)]
     if hands:
         question = "height" if terse else "How high is your pelvis, in metres?"

@@ -34,7 +34,7 @@ USABLE, STANDOFF = 0.95, 0.6
 #: Body shifts are rounded to this, metres.
 STEP_M = 0.1
 
-#: Terse questions about the body use words that planning has taught: the base stage does not ask them.
+#: Terse questions about the body use words that planning teaches.
 QUESTIONS: Mapping[str, Mapping[Style, str]] = {
     "side": {"terse": "side {}", "full": "Is {} to the left, ahead or to the right?"},
     "distance": {"terse": "distance {}", "full": "Is {} near, middle or far?"},

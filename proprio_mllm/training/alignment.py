@@ -34,13 +34,12 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, described_motion, felt_body, filled_motion, looking, made_motion
 from proprio_mllm.training.judging import judge_example
+from proprio_mllm.training.phrases import body_state_words
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Judgements, Views
 
 __all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Phase", "body_state", "body_state_accuracy"]
 
 Kind = Literal["say", "feel", "do", "fill", "say_image", "body", "plan", "exercise"]
-#: Pelvis heights are said in multiples of this, metres.
-_HEIGHT_STEP_M: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +54,7 @@ PHASES: Final[Mapping[str, Phase]] = {
     "text": Phase(("rows", "lora"), ("say", "feel", "do", "fill")),
     "image": Phase(("rows", "cse", "mpe"), ("say_image", "body")),
     "joint": Phase(
-        ("rows", "lora", "cse", "mpe", "merger"), ("say", "feel", "feel", "do", "fill", "say_image", "body", "body", "plan")
+        ("rows", "lora", "cse", "mpe", "merger"), ("say", "feel", "do", "fill", "say_image", "body", "body", "body", "plan")
     ),
 }
 
@@ -141,9 +140,8 @@ class AlignmentData:
 
 def body_state(motion: NDArray[np.floating]) -> tuple[str, str]:
     """Which hands are open at the end of a window (T, F), and the pelvis' height in metres, in words."""
-    hands = [name for name, opening in zip(("left", "right"), motion[-1, HAND_OPENING], strict=True) if opening >= OPEN_HAND]
-    steps = round(float(motion[-1, PELVIS_HEIGHT]) / _HEIGHT_STEP_M)
-    return " ".join(hands) or "none", f"{steps * _HEIGHT_STEP_M:.2f}"
+    left, right = motion[-1, HAND_OPENING] >= OPEN_HAND
+    return body_state_words(bool(left), bool(right), float(motion[-1, PELVIS_HEIGHT]))
 
 
 def _by_open_hands(demos: Demos) -> list[NDArray[np.int64]]:

@@ -3,14 +3,15 @@
 Three parts, each needed (a small model trained on questions alone never binds words to image regions): dense, name-tied
 pretraining of the vision tower on the simulator's truth; grounding questions packed per image and image-to-text listing;
 planning demonstrations without proprioception, with judging questions about the expert's logs among them, and planning
-exercises in text alone. Its result is also the table row "Qwen2.5-VL-Ins" at this size. The paper has no such stage.
+exercises and phrases in text alone. Its result is also the table row "Qwen2.5-VL-Ins" at this size. The paper has no such
+stage.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -22,9 +23,14 @@ from proprio_mllm.model.dense import DenseHead, DenseTargets, dense_targets
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
 from proprio_mllm.training.judging import judge_example
-from proprio_mllm.training.sources import GROUNDING, Demos, Exercises, Views
+from proprio_mllm.training.phrases import phrase
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Views
 
 __all__ = ["DenseObjective", "JointObjective", "exercise_accuracy", "grounding_accuracy", "plan_accuracy"]
+
+
+#: Share of phrases among the exercises.
+PHRASES: Final = 0.1
 
 
 class _WithDense(nn.Module):
@@ -87,7 +93,7 @@ class _Base:
         examples = []
         for row in rows:
             # the list comes last: its order, from left to right, would give away where things are
-            pairs = [*self._views.pairs(row, GROUNDING, questions, rng), self._views.listing(row)]
+            pairs = [*self._views.pairs(row, (*GROUNDING, *BODY_RELATIVE), questions, rng), self._views.listing(row)]
             examples.append(Example(looking(pairs), (row.view,)))
         return _JointBatch("look", self._collator(examples), None, targets, self._cfg.dense_weight)
 
@@ -121,23 +127,29 @@ class JointObjective(_Base):
         views: Views,
         demos: Demos,
         exercises: Exercises,
+        clips: Clips,
         cfg: BaseConfig,
         key: str,
     ) -> None:
         super().__init__(model, head, views, cfg, key)
-        self._demos, self._exercises = demos, exercises
+        self._demos, self._exercises, self._clips = demos, exercises, clips
 
     def batch(self, rng: np.random.Generator, size: int) -> _JointBatch:
         """A batch of views or of planning steps."""
         if rng.random() >= self._cfg.plan_share:
             return self._view_batch(rng, size, self._cfg.questions)
         if rng.random() < self._cfg.exercise_share:
-            return _JointBatch("exercise", self._collator([self._exercises.draw(rng) for _ in range(size)]), None, None, 0.0)
+            return _JointBatch("exercise", self._collator([self._words(rng) for _ in range(size)]), None, None, 0.0)
         examples = [
             judge_example(self._demos, i, rng, None) if rng.random() < self._cfg.judge_share else self._demos.example(i, None)
             for i in self._demos.draw(rng, size)
         ]
         return _JointBatch("plan", self._collator(examples), None, None, 0.0)
+
+    def _words(self, rng: np.random.Generator) -> Example:
+        if rng.random() < PHRASES:
+            return phrase(self._clips, rng, self._demos.style)
+        return self._exercises.draw(rng)
 
 
 @torch.no_grad()

@@ -42,6 +42,8 @@ logger = logging.getLogger(__name__)
 
 Metrics = dict[str, float]
 
+#: Raised when what a stage trains on changes in code, so that older output is not taken for current.
+RECIPES: Final[Mapping[str, int]] = {"base": 2, "alignment": 2}
 #: Stages whose current output a stage starts from.
 NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
     "corrections": ("base",),
@@ -105,7 +107,8 @@ class Pipeline:
         plain = dataclasses.asdict(base_model_config(cfg.model))
         if name == "base":
             inputs = {kind: shard_hash(shards(kind)) for kind in ("views", "exercises", "demos", "clips")}
-            return stage_key({"base": dataclasses.asdict(cfg.base), "model": plain}, cfg.seed, inputs)
+            wanted = {"base": dataclasses.asdict(cfg.base), "model": plain, "recipe": RECIPES["base"]}
+            return stage_key(wanted, cfg.seed, inputs)
         if name == "corrections":
             wanted = {"episodes": cfg.corrections.episodes, "expert_share": cfg.corrections.expert_share}
             return stage_key(wanted, cfg.seed, {"base": self.key("base")})
@@ -122,7 +125,8 @@ class Pipeline:
         model = dataclasses.asdict(variant_model(cfg.model, cfg.variant))
         if name == "alignment":
             inputs = {stage: self.key(stage) for stage in NEEDS["alignment"]} | {"judgements": shard_hash(shards("judgements"))}
-            return stage_key({"alignment": dataclasses.asdict(cfg.alignment), "model": model}, cfg.seed, inputs)
+            wanted = {"alignment": dataclasses.asdict(cfg.alignment), "model": model, "recipe": RECIPES["alignment"]}
+            return stage_key(wanted, cfg.seed, inputs)
         if name == "selu":
             return stage_key({"selu": dataclasses.asdict(cfg.selu)}, cfg.seed, {"alignment": self.key("alignment")})
         raise ValueError(f"stage {name!r} has no key; allowed: {', '.join(STAGES)}")
@@ -185,10 +189,11 @@ class Pipeline:
         dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
         self._train_dense(dense, model, head, folder / "dense")
         model.requires_grad_(True)
-        joint = JointObjective(model, head, views, demos, exercises, cfg.base, f"{key}/joint")
+        joint = JointObjective(model, head, views, demos, exercises, clips, cfg.base, f"{key}/joint")
         self.loop(joint, cfg.base.joint, folder / "joint")
         save_model(model.eval(), self.paths.model("base"))
-        return {**grounding_accuracy(model, views), **plan_accuracy(model, demos), **exercise_accuracy(model, exercises)}
+        asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE))
+        return {**asked, **plan_accuracy(model, demos), **exercise_accuracy(model, exercises)}
 
     def _corrections(self, folder: Path, key: str) -> Metrics:
         cfg = self.cfg.corrections

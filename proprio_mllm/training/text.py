@@ -14,6 +14,7 @@ from proprio_mllm.model.chat import render
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import critic_prompt, looking, self_ask_prompt
 from proprio_mllm.training.goals import type_words
+from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Views
 
 __all__ = ["corpus", "start_from_words", "whole_words"]
@@ -39,6 +40,7 @@ def corpus(
         example = demos.example(int(index), None)
         texts.append(render(example.messages))
     texts.extend(render(exercises.draw(rng).messages) for _ in range(limit))
+    texts.extend(render(phrase(clips, rng, cfg.prompt).messages) for _ in range(limit // 4))
     for index in _some(views.split.train, limit // 4, rng):
         row = views.row(int(index))
         pairs = [views.listing(row), *views.pairs(row, (*GROUNDING, *BODY_RELATIVE), 10, rng)]

@@ -11,6 +11,7 @@ from configs.schema.model import ModelConfig
 from data.motion import HAND_OPENING, N_FEATURES, PELVIS_HEIGHT
 from proprio_mllm.training.alignment import body_state
 from proprio_mllm.training.motion_stage import FEATURE_BIAS, MotionWindows
+from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import Clips
 
 
@@ -37,3 +38,18 @@ def test_hands_and_height_weigh_more_than_single_coordinates(shards: Path, cfg: 
     assert np.allclose(deviation * FEATURE_BIAS, frames.std(axis=0), atol=1e-4)
     assert (FEATURE_BIAS[HAND_OPENING] > FEATURE_BIAS[PELVIS_HEIGHT]).all()
     assert FEATURE_BIAS[PELVIS_HEIGHT] > FEATURE_BIAS[0]
+
+
+def test_phrases_teach_the_words_without_motion(shards: Path, cfg: ModelConfig) -> None:
+    clips, rng = Clips(shards / "clips"), np.random.default_rng(0)
+    drawn = [phrase(clips, rng, "terse") for _ in range(60)]
+    assert not any(example.views or "<motion" in message.text for example in drawn for message in example.messages)
+    captions = {caption for index in clips.split.train for caption in clips.captions[int(index)]}
+    told = [example for example in drawn if example.messages[1].text != "say "]
+    assert 15 < len(told) < 45
+    assert all(example.messages[-1].text in captions for example in drawn if example not in told)
+    for example in told:
+        words = example.messages[1].text.split()
+        opened = [hand for hand in ("left", "right") if words[words.index(hand) + 1] == "open"]
+        assert example.messages[2].text == (" ".join(opened) or "none")
+        assert example.messages[-1].text == words[words.index("height") + 1]

@@ -20,6 +20,7 @@ from data.records import Camera, Observation, Proprioception
 from data.shards import ShardError, ShardReader, ShardWriter
 from proprio_mllm.model.building import add_adapter, load_model
 from proprio_mllm.model.groups import train_only
+from proprio_mllm.training import pipeline as pipeline_module
 from proprio_mllm.training import release
 from proprio_mllm.training.alignment import PHASES, AlignmentObjective
 from proprio_mllm.training.pipeline import STAGES, Pipeline, StageError, variant_model
@@ -116,6 +117,13 @@ def test_current_stages_are_skipped_and_others_are_not(trained: Pipeline) -> Non
     corrected = Pipeline(dataclasses.replace(trained.cfg, corrections=more), collect)
     assert corrected.key("base") == trained.key("base")
     assert corrected.key("alignment") != trained.key("alignment")
+
+
+def test_a_new_recipe_makes_older_output_stale(trained: Pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {name: trained.key(name) for name in ("base", "corrections", "tokenizer", "alignment", "selu")}
+    monkeypatch.setattr(pipeline_module, "RECIPES", {"base": 99, "alignment": 1})
+    changed = {name for name in before if trained.key(name) != before[name]}
+    assert changed == {"base", "corrections", "alignment", "selu"}
 
 
 def test_a_stage_names_what_it_needs(trained: Pipeline, tmp_path: Path) -> None:
