@@ -149,13 +149,18 @@ class ProprioMLLM(nn.Module):
         inputs["mm_encoder_outputs"] = {"image": BaseModelOutputWithPooling(pooler_output=per_image)}
         return inputs, visual
 
-    def forward(self, batch: Batch, return_logits: bool = False) -> ModelOutput:
+    def forward(self, batch: Batch | tuple[Batch, ...], return_logits: bool = False) -> ModelOutput:
         """Loss of a batch.
 
         Args:
-            batch: from the collator.
-            return_logits: also compute the logits of every position.
+            batch: from the collator, or its parts; the loss of parts is that of the batch they make up.
+            return_logits: also compute the logits of every position; not of parts.
         """
+        if isinstance(batch, tuple):
+            outs = [self.forward(part) for part in batch]
+            count = sum(out.supervised for out in outs)
+            loss = torch.stack([out.loss * (out.supervised / max(count, 1)) for out in outs]).sum()
+            return ModelOutput(loss, count, sum(out.correct for out in outs), None)
         inputs, visual = self._inputs(batch)
         if bool((batch.attention_mask.diff(dim=1) <= 0).all()):
             # Padding stands right of every token, where causal attention never looks: no mask, and the fast kernel.

@@ -86,25 +86,27 @@ class AlignmentData:
     def _encode(self, windows: NDArray[np.float32]) -> list[list[int]]:
         return self.tokenizer.encode(torch.from_numpy(windows).to(self.tokenizer.mean.device)).tolist()
 
-    def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> Batch:
-        """A batch of one kind from the training rows."""
+    def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> tuple[Batch, ...]:
+        """A batch of one kind from the training rows, in parts."""
         if kind == "exercise":
             judged = rng.random(size) < self._cfg.judge_share
-            return self._collator([(self.judgements if one else self.exercises).draw(rng) for one in judged])
+            return self._collator.in_parts([(self.judgements if one else self.exercises).draw(rng) for one in judged])
         if kind == "plan":
             rows = self.demos.draw(rng, size)
-            return self._collator([self._plan(int(i), rng) for i in rows])
+            return self._collator.in_parts([self._plan(int(i), rng) for i in rows])
         if kind == "body":
-            return self._collator([self._body(int(i), rng) for i in rng.choice(self.views.split.train, size)])
+            return self._collator.in_parts([self._body(int(i), rng) for i in rng.choice(self.views.split.train, size)])
         if kind == "feel":
             groups = rng.integers(len(self._grips), size=size)
-            return self._collator([self._feel(int(rng.choice(self._grips[g]))) for g in groups])
+            return self._collator.in_parts([self._feel(int(rng.choice(self._grips[g]))) for g in groups])
         if kind == "say_image":
-            return self._collator([self._say_image(int(i), rng) for i in rng.choice(self._pictured, size)])
+            return self._collator.in_parts([self._say_image(int(i), rng) for i in rng.choice(self._pictured, size)])
         frames = self.tokenizer.cfg.window
         rows = rng.choice(self.clips.split.train, size)
         codes = self._encode(np.stack([self.clips.window(int(i), frames, rng) for i in rows]))
-        return self._collator([self._motion_text(kind, int(i), code, rng) for i, code in zip(rows, codes, strict=True)])
+        return self._collator.in_parts(
+            [self._motion_text(kind, int(i), code, rng) for i, code in zip(rows, codes, strict=True)]
+        )
 
     def _plan(self, index: int, rng: np.random.Generator) -> Example:
         if rng.random() < self._cfg.judge_share:
@@ -192,7 +194,7 @@ class AlignmentObjective:
         self._data, self._cfg = data, cfg
         self._kinds: tuple[Kind, ...] = kinds if model.cfg.proprioception else ("body", "plan")
 
-    def batch(self, rng: np.random.Generator, size: int) -> tuple[Kind, Batch]:
+    def batch(self, rng: np.random.Generator, size: int) -> tuple[Kind, tuple[Batch, ...]]:
         """A batch of one kind, drawn anew each step."""
         others: tuple[Kind, ...] = tuple(kind for kind in self._kinds if kind != "plan")
         if "plan" in self._kinds and rng.random() < self._cfg.plan_share:
@@ -202,7 +204,7 @@ class AlignmentObjective:
         return kind, self._data.batch(kind, rng, size)
 
     def loss(
-        self, module: nn.Module, batch: tuple[Kind, Batch], generator: torch.Generator
+        self, module: nn.Module, batch: tuple[Kind, tuple[Batch, ...]], generator: torch.Generator
     ) -> tuple[Tensor, Mapping[str, float]]:
         """Cross-entropy over the answers; nothing is drawn."""
         del generator

@@ -65,7 +65,7 @@ class _WithDense(nn.Module):
 @dataclass(frozen=True, slots=True)
 class _JointBatch(Movable):
     kind: Literal["dense", "look", "plan", "exercise"]
-    text: Batch | None
+    text: Batch | tuple[Batch, ...] | None
     images: ImageBatch | None
     dense: DenseTargets | None
     dense_weight: float
@@ -139,12 +139,12 @@ class JointObjective(_Base):
         if rng.random() >= self._cfg.plan_share:
             return self._view_batch(rng, size, self._cfg.questions)
         if rng.random() < self._cfg.exercise_share:
-            return _JointBatch("exercise", self._collator([self._words(rng) for _ in range(size)]), None, None, 0.0)
+            return _JointBatch("exercise", self._collator.in_parts([self._words(rng) for _ in range(size)]), None, None, 0.0)
         examples = [
             judge_example(self._demos, i, rng, None) if rng.random() < self._cfg.judge_share else self._demos.example(i, None)
             for i in self._demos.draw(rng, size)
         ]
-        return _JointBatch("plan", self._collator(examples), None, None, 0.0)
+        return _JointBatch("plan", self._collator.in_parts(examples), None, None, 0.0)
 
     def _words(self, rng: np.random.Generator) -> Example:
         if rng.random() < PHRASES:

@@ -74,14 +74,16 @@ class ExampleObjective:
         self._share = replay_share if self._examples else 1.0
         self._collator = Collator(model.processor, model.cfg)
 
-    def batch(self, rng: np.random.Generator, size: int) -> Batch:
+    def batch(self, rng: np.random.Generator, size: int) -> tuple[Batch, ...]:
         """Stored and replayed examples."""
         drawn = rng.random(size) < self._share
-        return self._collator(
+        return self._collator.in_parts(
             [self._replay(rng) if fresh else self._examples[int(rng.integers(len(self._examples)))] for fresh in drawn]
         )
 
-    def loss(self, module: nn.Module, batch: Batch, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
+    def loss(
+        self, module: nn.Module, batch: tuple[Batch, ...], generator: torch.Generator
+    ) -> tuple[Tensor, Mapping[str, float]]:
         """Cross-entropy over the answers; nothing is drawn."""
         del generator
         out = module(batch)

@@ -80,6 +80,29 @@ def test_loss_is_the_mean_over_supervised_tokens(cfg, build, examples):
     assert float(whole.loss) == pytest.approx(total, rel=1e-5)
 
 
+def test_parts_of_similar_length_have_the_loss_and_gradients_of_the_batch(cfg, build, examples):
+    model, collate = build(cfg)
+    rows = [*examples, *examples]
+    parts = collate.in_parts(rows)
+    assert [part.input_ids.shape[0] for part in parts] == [2, 2, 2]
+    widths = [part.input_ids.shape[1] for part in parts]
+    assert widths == sorted(widths)
+    assert widths[0] < collate(rows).input_ids.shape[1]
+    gradients = []
+    for batch in (collate(rows), parts):
+        model.zero_grad()
+        out = model(batch)
+        out.loss.backward()
+        gradients.append((out, [p.grad.clone() for p in model.parameters() if p.grad is not None]))
+    (whole, expected), (split, got) = gradients
+    torch.testing.assert_close(whole.loss, split.loss, atol=1e-5, rtol=1e-5)
+    assert (whole.supervised, whole.correct) == (split.supervised, split.correct)
+    torch.testing.assert_close(expected, got, atol=1e-5, rtol=1e-3)
+    assert len(collate.in_parts(examples[:1])) == 1
+    moved = parts[0].to("meta")
+    assert moved.input_ids.device.type == "meta"
+
+
 def test_padding_side_does_not_matter_for_the_loss(cfg, build, examples):
     model, collate = build(cfg)
     with torch.no_grad():
