@@ -10,8 +10,8 @@
 other's pairs train. Besides clip captions, motion and image to text holds questions about the robot's own body in its scene
 (which arm reaches an object, how far the body must go down), and motion to text asks which hands are open and how high the
 pelvis is, which captions do not say and planning needs. A share of planning demonstrations, with motion tokens in the prompt,
-keeps the planner's format, and exercises in text alone keep what the base stage learnt from them; the paper does not mention
-any such replay. Corrections (`stage=corrections`) count as demonstrations here.
+keeps the planner's format, and exercises in words, now with motion that agrees with their log, keep what the base stage
+learnt from them; the paper does not mention any such replay. Corrections (`stage=corrections`) count as demonstrations here.
 
 The control `variant=no_proprio` has the joint phase alone, and of its pairs those that need no motion.
 """
@@ -35,7 +35,7 @@ from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, described_motion, felt_body, filled_motion, looking, made_motion
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.phrases import body_state_words
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Judgements, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, Exercises, Judgements, Views
 
 __all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Phase", "body_state", "body_state_accuracy"]
 
@@ -79,7 +79,7 @@ class AlignmentData:
         self._style: Style = model.cfg.prompt
         self._proprioception = model.cfg.proprioception
         self._demo_tokens = demos.tokens(tokenizer) if self._proprioception else None
-        self._grips = _by_open_hands(demos)
+        self.bodies = None if self._demo_tokens is None else Bodies(demos, self._demo_tokens)
         with_images = [i for i, images in enumerate(clips.reader.column("image_frames")) if images]
         self._pictured = np.intersect1d(np.asarray(with_images, dtype=np.int64), clips.split.train)
 
@@ -90,15 +90,18 @@ class AlignmentData:
         """A batch of one kind from the training rows, in parts."""
         if kind == "exercise":
             judged = rng.random(size) < self._cfg.judge_share
-            return self._collator.in_parts([(self.judgements if one else self.exercises).draw(rng) for one in judged])
+            drawn = [self.judgements.draw(rng) if one else self.exercises.draw(rng, self.bodies) for one in judged]
+            return self._collator.in_parts(drawn)
         if kind == "plan":
             rows = self.demos.draw(rng, size)
             return self._collator.in_parts([self._plan(int(i), rng) for i in rows])
         if kind == "body":
             return self._collator.in_parts([self._body(int(i), rng) for i in rng.choice(self.views.split.train, size)])
         if kind == "feel":
-            groups = rng.integers(len(self._grips), size=size)
-            return self._collator.in_parts([self._feel(int(rng.choice(self._grips[g]))) for g in groups])
+            assert self.bodies is not None
+            grips = self.bodies.grips()
+            groups = rng.integers(len(grips), size=size)
+            return self._collator.in_parts([self._feel(int(rng.choice(grips[g]))) for g in groups])
         if kind == "say_image":
             return self._collator.in_parts([self._say_image(int(i), rng) for i in rng.choice(self._pictured, size)])
         frames = self.tokenizer.cfg.window
@@ -144,13 +147,6 @@ def body_state(motion: NDArray[np.floating]) -> tuple[str, str]:
     """Which hands are open at the end of a window (T, F), and the pelvis' height in metres, in words."""
     left, right = motion[-1, HAND_OPENING] >= OPEN_HAND
     return body_state_words(bool(left), bool(right), float(motion[-1, PELVIS_HEIGHT]))
-
-
-def _by_open_hands(demos: Demos) -> list[NDArray[np.int64]]:
-    """Training rows with the same hands open; drawing each set as often shows full hands as often as empty ones."""
-    opened = demos.motions[demos.split.train, -1, HAND_OPENING] >= OPEN_HAND  # (N, 2)
-    groups = [demos.split.train[(opened == state).all(axis=1)] for state in ([0, 0], [0, 1], [1, 0], [1, 1])]
-    return [group for group in groups if len(group)]
 
 
 @torch.no_grad()

@@ -24,7 +24,7 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.phrases import phrase
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, Exercises, Views
 
 __all__ = ["DenseObjective", "JointObjective", "exercise_accuracy", "grounding_accuracy", "plan_accuracy"]
 
@@ -197,14 +197,17 @@ def grounding_accuracy(
 
 
 @torch.no_grad()
-def exercise_accuracy(model: ProprioMLLM, exercises: Exercises, limit: int = 200) -> dict[str, float]:
-    """Share of held-out exercises in text alone that the model's greedy reply repeats exactly."""
-    collator = Collator(model.processor, model.cfg)
+def exercise_accuracy(
+    model: ProprioMLLM, exercises: Exercises, bodies: Bodies | None = None, limit: int = 200
+) -> dict[str, float]:
+    """Share of held-out exercises without pictures that the model's greedy reply repeats exactly; `bodies` adds motion."""
+    collator, rng = Collator(model.processor, model.cfg), np.random.default_rng(0)
     order = exercises.test[:: max(1, len(exercises.test) // limit)][:limit]
     exact = 0
     for start in range(0, len(order), 16):
         chunk = [int(i) for i in order[start : start + 16]]
-        batch = collator([exercises.example(i, answered=False) for i in chunk], generation=True).to(model.device)
+        asked = [exercises.example(i, False, exercises.motion(i, bodies, rng)) for i in chunk]
+        batch = collator(asked, generation=True).to(model.device)
         replies = model.reply(batch, 40)
         exact += sum(reply.strip() == exercises.target(i) for i, reply in zip(chunk, replies, strict=True))
     return {"exercise_exact": exact / max(len(order), 1), "exercise_steps": float(len(order))}

@@ -43,7 +43,7 @@ logger = logging.getLogger(__name__)
 Metrics = dict[str, float]
 
 #: Raised when what a stage trains on changes in code, so that older output is not taken for current.
-RECIPES: Final[Mapping[str, int]] = {"base": 2, "alignment": 2}
+RECIPES: Final[Mapping[str, int]] = {"base": 2, "alignment": 3}
 #: Stages whose current output a stage starts from.
 NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
     "corrections": ("base",),
@@ -286,7 +286,7 @@ class Pipeline:
         save_model(model.eval(), self.paths.model("alignment"), read)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
         felt = body_state_accuracy(model, demos, read) if read is not None else {}
-        return {**asked, **felt, **plan_accuracy(model, demos, read), **exercise_accuracy(model, exercises)}
+        return {**asked, **felt, **plan_accuracy(model, demos, read), **exercise_accuracy(model, exercises, data.bodies)}
 
     def _selu(self, folder: Path, key: str) -> Metrics:
         from proprio_mllm.training.selu import run_selu

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from configs.schema.model import ModelConfig
-from data.motion import KEY_BODY_COUNT
+from data.motion import HAND_OPENING, KEY_BODY_COUNT, OPEN_HAND
 from data.records import Camera, HistoryItem
 from data.shards import Manifest, ShardError, ShardReader, decode_depth, decode_motion, decode_png, decode_segmentation
 from proprio_mllm.model.batch import Example, View
@@ -30,9 +30,9 @@ from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, answers, critic_prompt, named_prompt, plan_prompt, self_ask_prompt, with_answer
 from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
 from proprio_mllm.training.exercises import Exchange, is_symbolic
-from proprio_mllm.training.states import states_from_log
+from proprio_mllm.training.states import open_hands, states_from_log
 
-__all__ = ["Clips", "Demos", "Exercises", "Judgements", "Views", "held_out", "shard_hash"]
+__all__ = ["Bodies", "Clips", "Demos", "Exercises", "Judgements", "Views", "held_out", "shard_hash"]
 
 #: One in this many views, episodes and clips is never trained on.
 HELD_OUT = 20
@@ -167,9 +167,9 @@ def _planning(row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelCo
     )
 
 
-def _in_words(row: Mapping[str, Any], cfg: ModelConfig) -> list[Message]:
+def _in_words(row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelConfig) -> list[Message]:
     """The same without the picture."""
-    return [replace(message, images=0) for message in _planning(row, None, cfg)]
+    return [replace(message, images=0) for message in _planning(row, motion, cfg)]
 
 
 class _Joined:
@@ -235,11 +235,12 @@ class Demos:
         prompt = _planning(row, motion, self._cfg)
         return Example(with_answer(prompt, row["target"]) if answered else prompt, (self.view(row),))
 
-    def exercise(self, rng: np.random.Generator) -> Example:
-        """A step in text alone, names exchanged (see `exercises`)."""
-        row = self.reader[int(rng.choice(self._symbolic))]
-        exchanged = Exchange.draw(rng).row(row)
-        return Example(with_answer(_in_words(exchanged, self._cfg), exchanged["target"]))
+    def exercise(self, rng: np.random.Generator, bodies: Bodies | None = None) -> Example:
+        """A step without its picture, names exchanged (see `exercises`); with `bodies` its motion stays."""
+        index = int(rng.choice(self._symbolic))
+        exchanged = Exchange.draw(rng).row(self.reader[index])
+        motion = None if bodies is None else bodies.row(index)
+        return Example(with_answer(_in_words(exchanged, motion, self._cfg), exchanged["target"]))
 
     def view(self, row: Mapping[str, Any]) -> View:
         """The head-camera view of a row."""
@@ -249,6 +250,39 @@ class Demos:
     def target(self, index: int) -> str:
         """The expert's step."""
         return str(self.reader[int(index)]["target"])
+
+
+class Bodies:
+    """Recorded motion for steps that have none: that of the same robot with the same hands open.
+
+    Args:
+        demos: whose training rows lend their motion.
+        tokens: (N, T / stride) motion tokens of all rows.
+    """
+
+    def __init__(self, demos: Demos, tokens: NDArray[np.int64]) -> None:
+        self._tokens = tokens
+        robots = np.asarray(demos.reader.column("robot"))[demos.split.train]
+        opened = demos.motions[demos.split.train, -1, HAND_OPENING] >= OPEN_HAND  # (N, 2)
+        self._rows: dict[tuple[str, bool, bool], NDArray[np.int64]] = {}
+        for robot in sorted(set(robots.tolist())):
+            for left in (False, True):
+                for right in (False, True):
+                    chosen = demos.split.train[(robots == robot) & (opened == (left, right)).all(axis=1)]
+                    self._rows[robot, left, right] = chosen
+
+    def row(self, index: int) -> list[int]:
+        """A recorded step's own motion tokens."""
+        return self._tokens[index].tolist()
+
+    def draw(self, robot: str, left_open: bool, right_open: bool, rng: np.random.Generator) -> list[int] | None:
+        """Motion tokens of some recorded step; None when no row of this robot shows its hands so."""
+        rows = self._rows.get((robot, left_open, right_open), ())
+        return self.row(int(rng.choice(rows))) if len(rows) else None
+
+    def grips(self) -> list[NDArray[np.int64]]:
+        """Training rows by robot and open hands, without empty groups."""
+        return [rows for rows in self._rows.values() if len(rows)]
 
 
 class Exercises:
@@ -267,17 +301,25 @@ class Exercises:
         self._train = len(self.reader) - len(self.reader) // HELD_OUT
         self.test = np.arange(self._train, len(self.reader), dtype=np.int64)
 
-    def draw(self, rng: np.random.Generator) -> Example:
-        """A training example."""
+    def draw(self, rng: np.random.Generator, bodies: Bodies | None = None) -> Example:
+        """A training example; with `bodies` steps get motion whose hands agree with the log."""
         kind = rng.random()
         if kind < FROM_LOGS:
-            return self._demos.exercise(rng)
+            return self._demos.exercise(rng, bodies)
         index = int(rng.integers(self._train))
         if kind < FROM_LOGS + NAMING:
             return self._naming(index)
         if kind < FROM_LOGS + NAMING + STATES:
             return self._state(index, rng)
-        return self.example(index)
+        return self.example(index, motion=self.motion(index, bodies, rng))
+
+    def motion(self, index: int, bodies: Bodies | None, rng: np.random.Generator) -> list[int] | None:
+        """Motion for a row; None without `bodies`, or when the row's log is cut, so that its hands are not known."""
+        row = self.reader[int(index)]
+        if bodies is None or len(row["history"]) < int(row["step"]):
+            return None
+        opened = open_hands([HistoryItem(item["step"], item["feedback"]) for item in row["history"]])
+        return bodies.draw(row["robot"], *opened, rng)
 
     def _naming(self, index: int) -> Example:
         row = self.reader[index]
@@ -294,10 +336,10 @@ class Exercises:
         prompt = self_ask_prompt(relation, row["visible"], history, None, self._cfg.prompt)
         return Example(with_answer([replace(message, images=0) for message in prompt], answers(states[relation])))
 
-    def example(self, index: int, answered: bool = True) -> Example:
+    def example(self, index: int, answered: bool = True, motion: Sequence[int] | None = None) -> Example:
         """One row's conversation."""
         row = self.reader[int(index)]
-        prompt = _in_words(row, self._cfg)
+        prompt = _in_words(row, motion, self._cfg)
         return Example(with_answer(prompt, row["target"]) if answered else tuple(prompt))
 
     def target(self, index: int) -> str:

@@ -7,10 +7,29 @@ from typing import Final
 
 from data.records import Action, ActionError, HistoryItem
 
-__all__ = ["states_from_log"]
+__all__ = ["open_hands", "states_from_log"]
 
 _SWITCHES: Final = {"Open": "open", "Close": "closed", "ToggleOn": "switched on", "ToggleOff": "switched off", "Lift": "lifted"}
 _OPPOSITE: Final = {"open": "closed", "closed": "open", "switched on": "switched off", "switched off": "switched on"}
+
+
+def open_hands(history: Sequence[HistoryItem]) -> tuple[bool, bool]:
+    """Whether the left and the right hand are empty after a log that begins with empty hands."""
+    empty = {"left": True, "right": True}
+    for item in history:
+        for part in item.feedback.split(";"):
+            text, _, result = part.strip().rpartition(" ")
+            try:
+                action = Action.parse(text)
+            except ActionError:
+                continue
+            if result != "ok":
+                continue
+            if action.name in ("Pick", "Place") and action.arm is not None:
+                empty[action.arm.value] = action.name == "Place"
+            elif action.name in ("Lift", "PlaceBoth"):
+                empty = dict.fromkeys(empty, action.name == "PlaceBoth")
+    return empty["left"], empty["right"]
 
 
 def states_from_log(history: Sequence[HistoryItem]) -> dict[str, tuple[str, ...]]:

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from configs.schema.model import ModelConfig
+from data.motion import HAND_OPENING
+from data.records import HistoryItem
 from proprio_mllm.training.exercises import GROUPS, Exchange, is_symbolic
-from proprio_mllm.training.sources import Demos, Exercises
+from proprio_mllm.training.sources import Bodies, Demos, Exercises
+from proprio_mllm.training.states import open_hands
 from sim.tasks.instructions import natural_name
 
 ROW = {
@@ -81,3 +84,41 @@ def test_exercises_in_words_ask_for_steps_names_and_states(shards: Path, cfg: Mo
     assert 3 < endings.count("which") < 30
     named = next(example for example, ending in zip(drawn, endings, strict=True) if ending == "named?")
     assert named.messages[-1].text.endswith("_1")
+
+
+@pytest.mark.parametrize(
+    ("feedback", "expected"),
+    [
+        ((), (True, True)),
+        (("GoTo(Mug_1) ok", "Pick(left, Mug_1) ok"), (False, True)),
+        (("Pick(left, Mug_1) ok; Pick(right, Cup_1) ok", "Place(left, Shelf_1) ok"), (True, False)),
+        (("Pick(left, Mug_1) TooFar", "nonsense ok"), (True, True)),
+        (("Lift(Box_1) ok",), (False, False)),
+        (("Lift(Box_1) ok", "PlaceBoth(Desk_1) ok"), (True, True)),
+    ],
+)
+def test_a_log_tells_which_hands_are_empty(feedback: tuple[str, ...], expected: tuple[bool, bool]) -> None:
+    assert open_hands([HistoryItem(text, text) for text in feedback]) == expected
+
+
+def test_steps_in_words_get_motion_whose_hands_agree_with_the_log(shards: Path, cfg: ModelConfig) -> None:
+    demos = Demos(shards / "demos", cfg)
+    left, right = HAND_OPENING.start, HAND_OPENING.start + 1
+    demos.motions[:, -1, left], demos.motions[:, -1, right] = 1.0, 0.5
+    demos.motions[demos.split.train[0], -1, right] = 1.0
+    tokens = np.tile(np.arange(len(demos.motions))[:, None] % 16, (1, 4))
+    bodies = Bodies(demos, tokens)
+    rng = np.random.default_rng(0)
+    robot = demos.reader[int(demos.split.train[0])]["robot"]
+    assert bodies.draw(robot, True, True, rng) == tokens[demos.split.train[0]].tolist()
+    assert bodies.draw(robot, False, True, rng) is None
+    assert sum(len(rows) for rows in bodies.grips()) == len(demos.split.train)
+    exercises = Exercises(shards / "exercises", cfg, demos)
+    shown = [len(re.findall(r"<motion_\d+>", exercises.draw(rng, bodies).messages[1].text)) for _ in range(40)]
+    assert {0, 4} <= set(shown)
+    plain = [exercises.draw(rng).messages[1].text for _ in range(40)]
+    assert not any("<motion" in text for text in plain)
+    index = next(i for i in range(len(exercises.reader)) if len(exercises.reader[i]["history"]) == exercises.reader[i]["step"])
+    cut = {**exercises.reader[index], "step": 99}
+    exercises.reader = {index: cut}  # type: ignore[assignment]  # one row, as a reader would give it
+    assert exercises.motion(index, bodies, rng) is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -24,7 +25,8 @@ def fresh(shards: Path, cfg: ModelConfig) -> ProprioMLLM:
 
 def row(model: ProprioMLLM, text: str) -> torch.Tensor:
     ids = model.processor.tokenizer(text, add_special_tokens=False).input_ids
-    return model.core.get_input_embeddings().weight.detach()[ids].sum(0)
+    embeddings: Any = model.core.get_input_embeddings()
+    return embeddings.weight.detach()[ids].sum(0)
 
 
 def test_the_corpus_holds_every_kind_of_text(shards: Path, cfg: ModelConfig) -> None:
