@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from data.records import Action, ActionError, HistoryItem
@@ -13,22 +13,27 @@ _SWITCHES: Final = {"Open": "open", "Close": "closed", "ToggleOn": "switched on"
 _OPPOSITE: Final = {"open": "closed", "closed": "open", "switched on": "switched off", "switched off": "switched on"}
 
 
-def open_hands(history: Sequence[HistoryItem]) -> tuple[bool, bool]:
-    """Whether the left and the right hand are empty after a log that begins with empty hands."""
-    empty = {"left": True, "right": True}
+def _successes(history: Sequence[HistoryItem]) -> Iterator[Action]:
+    """The actions of a log that were carried out, in order."""
     for item in history:
         for part in item.feedback.split(";"):
             text, _, result = part.strip().rpartition(" ")
-            try:
-                action = Action.parse(text)
-            except ActionError:
-                continue
             if result != "ok":
                 continue
-            if action.name in ("Pick", "Place") and action.arm is not None:
-                empty[action.arm.value] = action.name == "Place"
-            elif action.name in ("Lift", "PlaceBoth"):
-                empty = dict.fromkeys(empty, action.name == "PlaceBoth")
+            try:
+                yield Action.parse(text)
+            except ActionError:
+                continue
+
+
+def open_hands(history: Sequence[HistoryItem]) -> tuple[bool, bool]:
+    """Whether the left and the right hand are empty after a log that begins with empty hands."""
+    empty = {"left": True, "right": True}
+    for action in _successes(history):
+        if action.name in ("Pick", "Place") and action.arm is not None:
+            empty[action.arm.value] = action.name == "Place"
+        elif action.name in ("Lift", "PlaceBoth"):
+            empty = dict.fromkeys(empty, action.name == "PlaceBoth")
     return empty["left"], empty["right"]
 
 
@@ -48,37 +53,29 @@ def states_from_log(history: Sequence[HistoryItem]) -> dict[str, tuple[str, ...]
         if place is not None:
             found.setdefault(f"on {place}", []).append(thing)
 
-    for item in history:
-        for part in item.feedback.split(";"):
-            text, _, result = part.strip().rpartition(" ")
-            try:
-                action = Action.parse(text)
-            except ActionError:
-                continue
-            thing = action.object_id or ""
-            if result != "ok":
-                continue
-            if action.name == "Pick" and action.arm is not None:
-                hands[action.arm.value] = thing
+    for action in _successes(history):
+        thing = action.object_id or ""
+        if action.name == "Pick" and action.arm is not None:
+            hands[action.arm.value] = thing
+            move(thing, None)
+        elif action.name == "Place" and action.arm is not None:
+            held = hands.pop(action.arm.value, None)
+            if held:
+                move(held, thing)
+        elif action.name == "PlaceBoth":
+            if lifted:
+                move(lifted, thing)
+                found["lifted"] = []
+            lifted = ""
+        elif action.name in _SWITCHES:
+            relation = _SWITCHES[action.name]
+            if action.name == "Lift":
+                lifted = thing
                 move(thing, None)
-            elif action.name == "Place" and action.arm is not None:
-                held = hands.pop(action.arm.value, None)
-                if held:
-                    move(held, thing)
-            elif action.name == "PlaceBoth":
-                if lifted:
-                    move(lifted, thing)
-                    found["lifted"] = []
-                lifted = ""
-            elif action.name in _SWITCHES:
-                relation = _SWITCHES[action.name]
-                if action.name == "Lift":
-                    lifted = thing
-                    move(thing, None)
-                opposite = found.get(_OPPOSITE.get(relation, ""), [])
-                if thing in opposite:
-                    opposite.remove(thing)
-                if thing not in found[relation]:
-                    found[relation].append(thing)
+            opposite = found.get(_OPPOSITE.get(relation, ""), [])
+            if thing in opposite:
+                opposite.remove(thing)
+            if thing not in found[relation]:
+                found[relation].append(thing)
     found["held"] = list(hands.values())
     return {name: tuple(things) for name, things in found.items()}
