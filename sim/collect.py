@@ -33,12 +33,13 @@ _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.
 _VERSION = {"views": 2, "demos": 3, "exercises": 2, "judgements": 2}
+_IN_WORDS = ("out", "workers", "views_per_world", "image_size", "noise", "medium_share")
 #: Fields that do not change what is written.
 _UNKEYED = {
     "views": ("out", "workers", "noise", "medium_share"),
     "demos": ("out", "workers", "views_per_world"),
-    "exercises": ("out", "workers", "views_per_world", "image_size", "noise", "medium_share"),
-    "judgements": ("out", "workers", "views_per_world", "image_size", "noise", "medium_share"),
+    "exercises": _IN_WORDS,
+    "judgements": _IN_WORDS,
 }
 
 

@@ -98,10 +98,9 @@ def corrections_of_part(config: CollectConfig, part: int, student: Student) -> I
 
 
 def _rows_of_part(config: CollectConfig, part: int, play: Play) -> Iterator[dict[str, Any]]:
-    first = part * config.part_size
     sessions: dict[tuple[str, str], Session] = {}
     try:
-        for index in range(first, min(first + config.part_size, config.count)):
+        for index in config.indices(part):
             episode = play(config, index, sessions)
             if episode.success:
                 yield from episode.rows

@@ -27,7 +27,7 @@ from sim.tasks.drafts import FAMILIES, Draft, NoDraft, Scene, category_of, draw
 from sim.tasks.jobs import Facts, Job, plan_jobs
 from sim.tasks.sample import rng_for, scene_of, typical_steps
 
-__all__ = ["Exercise", "Moment", "exercises_of_part", "judgement", "judgements_of_part", "play"]
+__all__ = ["Exercise", "exercises_of_part", "judgement", "judgements_of_part", "play"]
 
 #: Earlier steps that a row keeps.
 _HISTORY: Final = 8
@@ -55,38 +55,26 @@ _EXTRAS: Final = ("Sofa", "GarbageCan", "Chair", "TVStand", "SinkBasin")
 _FREE_ARMS: Final = (Arm.RIGHT, Arm.LEFT)
 
 
-@dataclass(frozen=True, slots=True)
-class Moment:
-    """What the robot knows at one time, as columns of a row (without the target)."""
-
-    columns: Mapping[str, Any]
-
-    def row(self, target: str, instruction: str | None = None) -> dict[str, Any]:
-        """A row with this target, under the episode's instruction or another one."""
-        return {**self.columns, "target": target} | ({} if instruction is None else {"instruction": instruction})
-
-
 @dataclass(slots=True)
 class Exercise:
     """One episode.
 
     Attributes:
         rows: recorded steps, ready for a shard.
-        moments: before every step, and at the end.
+        moments: what the robot knows before every step and at the end, as columns of a row without the target.
         success: whether the goals held at the end.
         codes: every outcome code that occurred.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
-    moments: list[Moment] = field(default_factory=list)
+    moments: list[dict[str, Any]] = field(default_factory=list)
     success: bool = False
     codes: set[str] = field(default_factory=set)
 
 
 def exercises_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
     """Rows of one part of an `exercises` folder; the same for the same configuration, whoever computes it."""
-    first = part * config.part_size
-    for index in range(first, min(first + config.part_size, config.count)):
+    for index in config.indices(part):
         yield from play(config, index).rows
 
 
@@ -108,20 +96,18 @@ def play(config: CollectConfig, index: int) -> Exercise:
     exercise = Exercise()
     history: list[dict[str, str]] = []
 
-    def moment(number: int) -> Moment:
-        return Moment(
-            {
-                "instruction": instruction,
-                "robot": robot,
-                "category": category_of(draft.family),
-                "step": number,
-                "step_budget": budget,
-                "visible": list(world.visible),
-                "known": world.known(),
-                "history": history[-_HISTORY:],
-                "named": list(draft.focus.values()),
-            }
-        )
+    def moment(number: int) -> dict[str, Any]:
+        return {
+            "instruction": instruction,
+            "robot": robot,
+            "category": category_of(draft.family),
+            "step": number,
+            "step_budget": budget,
+            "visible": list(world.visible),
+            "known": world.known(),
+            "history": history[-_HISTORY:],
+            "named": list(draft.focus.values()),
+        }
 
     for number in range(min(budget, _MAX_STEPS)):
         exercise.moments.append(moment(number))
@@ -130,7 +116,7 @@ def play(config: CollectConfig, index: int) -> Exercise:
             break
         target, justified = answer
         if justified:
-            exercise.rows.append(exercise.moments[-1].row(target.to_text()))
+            exercise.rows.append({**exercise.moments[-1], "target": target.to_text()})
         step = world.mistake(target) if rng.random() < mistakes else target
         outcomes = [(action, world.act(action)) for action in step.actions]
         exercise.codes |= {str(code) for _, code in outcomes}
@@ -144,8 +130,7 @@ def play(config: CollectConfig, index: int) -> Exercise:
 
 def judgements_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
     """Rows of one part of a `judgements` folder: one question of each episode."""
-    first = part * config.part_size
-    for index in range(first, min(first + config.part_size, config.count)):
+    for index in config.indices(part):
         yield judgement(config, index)
 
 
@@ -159,18 +144,19 @@ def judgement(config: CollectConfig, index: int) -> dict[str, Any]:
     exercise = play(config, index)
     end = exercise.moments[-1]
     if not exercise.success:
-        return end.row("no")
+        return {**end, "target": "no"}
     if rng.random() < 0.5:
-        return end.row("yes")
+        return {**end, "target": "yes"}
     if rng.random() < 0.2:
         other, scene = _draft(config, rng)
         instruction = other.sentences(scene.furniture, rng)[0]
-        row = end.row("no" if instruction != end.columns["instruction"] else "yes", instruction)
-        return row | {"named": list(other.focus.values())}
+        target = "no" if instruction != end["instruction"] else "yes"
+        return {**end, "instruction": instruction, "named": list(other.focus.values()), "target": target}
     earlier = exercise.moments[:-1]
     if not earlier:
-        return end.row("yes")
-    return (earlier[-1] if rng.random() < 0.5 else earlier[int(rng.integers(len(earlier)))]).row("no")
+        return {**end, "target": "yes"}
+    before = earlier[-1] if rng.random() < 0.5 else earlier[int(rng.integers(len(earlier)))]
+    return {**before, "target": "no"}
 
 
 def _draft(config: CollectConfig, rng: np.random.Generator) -> tuple[Draft, Scene]:

@@ -228,9 +228,8 @@ def _random_world(config: CollectConfig, index: int, rng: np.random.Generator) -
 
 def views_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
     """Rows of one part of a `views` folder; the same for the same configuration, whoever computes it."""
-    first = part * config.part_size
-    last = min(first + config.part_size, config.count)
-    for start in range(first, last, config.views_per_world):
+    numbers = config.indices(part)
+    for start in numbers[:: config.views_per_world]:
         index = start // config.views_per_world + part
         rng = rng_for("views", config.seed, start)
         world = _random_world(config, index, rng)
@@ -238,7 +237,7 @@ def views_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
         free = navigation_map(world, world.robot.footprint_radius_m).free_positions()
         renderer = Renderer(world, config.image_size, config.image_size)
         before = draw_pose(world, free, rng)
-        for number in range(start, min(start + config.views_per_world, last)):
+        for number in range(start, min(start + config.views_per_world, numbers.stop)):
             pose = draw_pose(world, free, rng)
             motion = lead_in(world, _nearby(before, pose, rng), pose, rng)
             view = renderer.view("head", depth=True, segmentation=True)

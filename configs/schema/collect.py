@@ -50,3 +50,8 @@ class CollectConfig:
                 raise ValueError(f"{name} must be within [0, 1], got {getattr(self, name)}")
         if not self.robots or not self.rooms:
             raise ValueError(f"robots and rooms must not be empty, got {self.robots} and {self.rooms}")
+
+    def indices(self, part: int) -> range:
+        """Numbers of the views or episodes of one part."""
+        first = part * self.part_size
+        return range(first, min(first + self.part_size, self.count))

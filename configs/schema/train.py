@@ -30,6 +30,11 @@ def _require(condition: bool, message: str) -> None:
         raise ValueError(message)
 
 
+def _require_shares(cfg: object, *names: str) -> None:
+    for name in names:
+        _require(0.0 <= getattr(cfg, name) <= 1.0, f"{name} {getattr(cfg, name)} outside [0, 1]")
+
+
 @dataclass(frozen=True)
 class LoopConfig:
     """One run of the training loop.
@@ -89,8 +94,7 @@ class BaseConfig:
     dense_weight: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("plan_share", "exercise_share", "judge_share"):
-            _require(0.0 <= getattr(self, name) <= 1.0, f"{name} {getattr(self, name)} outside [0, 1]")
+        _require_shares(self, "plan_share", "exercise_share", "judge_share")
         _require(self.questions > 0, f"questions {self.questions} must be positive")
 
 
@@ -103,7 +107,7 @@ class AlignmentConfig:
         image: loop of phase 2a-ii, motion and image; the language model's LoRA frozen.
         joint: loop of phase 2b; rows, LoRA, CSE and merger train.
         plan_share: share of the joint batches that are planning demonstrations with proprioception, or exercises.
-        exercise_share: share of exercises in text alone among them.
+        exercise_share: share of exercises without pictures among them.
         judge_share: share of judging questions among the planning demonstrations, and among the exercises.
         questions: body-relative questions packed per image.
         mask: share of motion tokens hidden in masked motion.
@@ -119,8 +123,7 @@ class AlignmentConfig:
     mask: float = 0.3
 
     def __post_init__(self) -> None:
-        for name in ("plan_share", "exercise_share", "judge_share", "mask"):
-            _require(0.0 <= getattr(self, name) <= 1.0, f"{name} {getattr(self, name)} outside [0, 1]")
+        _require_shares(self, "plan_share", "exercise_share", "judge_share", "mask")
         _require(self.questions > 0, f"questions {self.questions} must be positive")
 
 
@@ -183,7 +186,7 @@ class CorrectionsConfig:
     def __post_init__(self) -> None:
         _require(self.episodes >= 0, f"episodes {self.episodes} must not be negative")
         _require(self.workers > 0, f"workers {self.workers} must be positive")
-        _require(0.0 <= self.expert_share <= 1.0, f"expert_share {self.expert_share} outside [0, 1]")
+        _require_shares(self, "expert_share")
 
 
 @dataclass(frozen=True)

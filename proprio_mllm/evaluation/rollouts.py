@@ -81,7 +81,8 @@ def collect_rollouts(
         make = functools.partial(EpisodeWorker, setup) if opener is None else functools.partial(EpisodeWorker, setup, opener)
         _run_parts(writer, parts, make, min(workers, os.cpu_count() or 1), len(jobs))
     if not writer.manifest.complete:
-        writer.finish({"actor": str(request.model), "temperature": request.temperature})
+        broken = request.episodes - sum(part.rows for part in writer.manifest.parts.values())
+        writer.finish({"actor": str(request.model), "temperature": request.temperature, "infrastructure_errors": broken})
 
 
 def _run_parts(
@@ -91,12 +92,11 @@ def _run_parts(
     workers: int,
     total: int,
 ) -> None:
-    """Writes every part as soon as its last episode ends, and notes how many episodes broke and are left out."""
+    """Writes every part as soon as its last episode ends; episodes that broke are left out."""
     owner = {_name(job.fields): index for index, jobs in parts.items() for job in jobs}
     left = {index: len(jobs) for index, jobs in parts.items()}
     rows: dict[int, list[dict[str, Any]]] = {index: [] for index in parts}
     queue = [job for jobs in parts.values() for job in jobs]
-    broken = dict.fromkeys(parts, 0)
     with tqdm(total=total, initial=total - len(queue), desc="rollouts", unit="episode") as bar:
         for result in run_jobs(make, queue, workers, _never, lost_episode):
             bar.update(1)
@@ -104,13 +104,10 @@ def _run_parts(
             index = owner[record.task, record.robot, record.trial]
             left[index] -= 1
             if result.rollout is None:
-                broken[index] += 1
                 logger.warning("rollout of %s broke: %s", record.task, record.message[-300:])
             else:
                 rows[index].append(dict(result.rollout))
             if not left[index]:
-                earlier = int(writer.manifest.metadata.get("infrastructure_errors", 0))
-                writer.annotate({"infrastructure_errors": earlier + broken[index]})
                 writer.write(index, sorted(rows.pop(index), key=lambda row: row["episode"]))
 
 

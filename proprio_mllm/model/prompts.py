@@ -61,6 +61,12 @@ def _ids(ids: Iterable[str], style: Style) -> str:
     return "".join(listed) if style == "terse" else (", ".join(listed) or "none")
 
 
+def _elsewhere(visible: Sequence[str], known: Sequence[str]) -> list[str]:
+    """Known ids that are not in view."""
+    seen = set(visible)
+    return [name for name in known if name not in seen]
+
+
 def _body(motion: Sequence[int] | None, style: Style) -> str:
     if motion is None:
         return ""
@@ -100,8 +106,7 @@ def plan_prompt(
         style: terse or full.
         last: number of earlier steps shown.
     """
-    seen = set(visible)
-    other = [name for name in known if name not in seen]
+    other = _elsewhere(visible, known)
     if style == "terse":
         text = (
             f"{_body(motion, style)}{robot} {step + 1}/{step_budget} {instruction}\n"
@@ -206,8 +211,7 @@ def critic_prompt(
 
 def named_prompt(instruction: str, visible: Sequence[str], known: Sequence[str], style: Style = "terse") -> tuple[Message, ...]:
     """Which objects does an instruction name? The reply lists ids as `answers` writes them, in the task's order."""
-    seen = set(visible)
-    other = [name for name in known if name not in seen]
+    other = _elsewhere(visible, known)
     if style == "terse":
         text = f"{instruction}\nsee {_ids(visible, style)}\nknow {_ids(other, style)}\nnamed?"
     else:

@@ -33,6 +33,7 @@ from proprio_mllm.model.batch import Batch, Collator, Example
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, described_motion, felt_body, filled_motion, looking, made_motion
+from proprio_mllm.training.asking import answer_shares
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.phrases import body_state_words
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, Exercises, Judgements, Views
@@ -88,28 +89,24 @@ class AlignmentData:
 
     def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> tuple[Batch, ...]:
         """A batch of one kind from the training rows, in parts."""
+        return self._collator.in_parts(self._examples(kind, rng, size))
+
+    def _examples(self, kind: Kind, rng: np.random.Generator, size: int) -> list[Example]:
         if kind == "exercise":
             judged = rng.random(size) < self._cfg.judge_share
-            drawn = [self.judgements.draw(rng) if one else self.exercises.draw(rng, self.bodies) for one in judged]
-            return self._collator.in_parts(drawn)
+            return [self.judgements.draw(rng) if one else self.exercises.draw(rng, self.bodies) for one in judged]
         if kind == "plan":
-            rows = self.demos.draw(rng, size)
-            return self._collator.in_parts([self._plan(int(i), rng) for i in rows])
+            return [self._plan(int(i), rng) for i in self.demos.draw(rng, size)]
         if kind == "body":
-            return self._collator.in_parts([self._body(int(i), rng) for i in rng.choice(self.views.split.train, size)])
+            return [self._body(int(i), rng) for i in rng.choice(self.views.split.train, size)]
         if kind == "feel":
-            assert self.bodies is not None
-            grips = self.bodies.grips()
-            groups = rng.integers(len(grips), size=size)
-            return self._collator.in_parts([self._feel(int(rng.choice(grips[g]))) for g in groups])
+            return self._feel(rng, size)
         if kind == "say_image":
-            return self._collator.in_parts([self._say_image(int(i), rng) for i in rng.choice(self._pictured, size)])
+            return [self._say_image(int(i), rng) for i in rng.choice(self._pictured, size)]
         frames = self.tokenizer.cfg.window
         rows = rng.choice(self.clips.split.train, size)
         codes = self._encode(np.stack([self.clips.window(int(i), frames, rng) for i in rows]))
-        return self._collator.in_parts(
-            [self._motion_text(kind, int(i), code, rng) for i, code in zip(rows, codes, strict=True)]
-        )
+        return [self._motion_text(kind, int(i), code, rng) for i, code in zip(rows, codes, strict=True)]
 
     def _plan(self, index: int, rng: np.random.Generator) -> Example:
         if rng.random() < self._cfg.judge_share:
@@ -125,9 +122,12 @@ class AlignmentData:
         hidden = rng.random(len(codes)) < self._cfg.mask
         return Example(filled_motion([None if h else c for c, h in zip(codes, hidden, strict=True)], codes, self._style))
 
-    def _feel(self, index: int) -> Example:
-        assert self._demo_tokens is not None
-        return Example(felt_body(self._demo_tokens[index].tolist(), *body_state(self.demos.motions[index]), self._style))
+    def _feel(self, rng: np.random.Generator, size: int) -> list[Example]:
+        """Every grip as often: full hands are rare."""
+        assert self.bodies is not None
+        grips = self.bodies.grips
+        rows = [int(rng.choice(grips[group])) for group in rng.integers(len(grips), size=size)]
+        return [Example(felt_body(self.bodies.row(i), *body_state(self.demos.motions[i]), self._style)) for i in rows]
 
     def _say_image(self, clip: int, rng: np.random.Generator) -> Example:
         view, motion = self.clips.view(clip, rng)
@@ -155,25 +155,16 @@ def body_state_accuracy(model: ProprioMLLM, demos: Demos, tokens: MotionTokenize
 
     The height is asked after the right answer about the hands.
     """
-    collator = Collator(model.processor, model.cfg)
     codes = demos.tokens(tokens)
     rows = [int(i) for i in demos.split.test[:limit]]
     truth = [body_state(demos.motions[i]) for i in rows]
     result: dict[str, float] = {}
     for part, name in enumerate(("hands", "pelvis")):
-        right = 0
-        for start in range(0, len(rows), 16):
-            chunk = range(start, min(start + 16, len(rows)))
-            told = [truth[k][0] if part else "" for k in chunk]
-            asked = [
-                Example(felt_body(codes[rows[k]].tolist(), hands, "", model.cfg.prompt))
-                for k, hands in zip(chunk, told, strict=True)
-            ]
-            replies = model.reply(collator(asked, generation=True).to(model.device), 10)
-            right += sum(reply.strip() == truth[k][part] for reply, k in zip(replies, chunk, strict=True))
-        answers = [answer[part] for answer in truth]
-        result[f"{name}_accuracy"] = right / max(len(rows), 1)
-        result[f"{name}_majority"] = max((answers.count(a) for a in set(answers)), default=0) / max(len(rows), 1)
+        asked = [
+            Example(felt_body(codes[i].tolist(), hands if part else "", "", model.cfg.prompt))
+            for i, (hands, _) in zip(rows, truth, strict=True)
+        ]
+        result |= answer_shares(model, name, asked, [state[part] for state in truth])
     return result
 
 

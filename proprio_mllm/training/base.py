@@ -22,15 +22,17 @@ from proprio_mllm.model.batch import Batch, Collator, Example, ImageBatch, Movab
 from proprio_mllm.model.dense import DenseHead, DenseTargets, dense_targets
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
+from proprio_mllm.training.asking import answer_shares, replies
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, Exercises, Views
 
 __all__ = ["DenseObjective", "JointObjective", "exercise_accuracy", "grounding_accuracy", "plan_accuracy"]
 
-
 #: Share of phrases among the exercises.
 PHRASES: Final = 0.1
+#: Tokens of the longest planning step.
+_LONGEST_STEP: Final = 40
 
 
 class _WithDense(nn.Module):
@@ -171,27 +173,19 @@ def grounding_accuracy(
         seed: of the choice of objects.
         tokens: motion tokenizer, for questions with proprioception; None asks without.
     """
-    collator = Collator(model.processor, model.cfg)
     rng = np.random.default_rng(seed)
     result: dict[str, float] = {}
     rows = [views.row(i) for i in views.split.test[:limit]]
     for kind in kinds:
-        asked: list[tuple[Example, str]] = []
+        asked: list[Example] = []
+        answers: list[str] = []
         for row in rows:
-            pairs = views.pairs(row, (kind,), 1, rng)
-            if pairs:
+            for question, answer in views.pairs(row, (kind,), 1, rng):
                 motion = None if tokens is None else tokens.encode_window(row.motion)
-                asked.append((Example(looking([(pairs[0][0], "")], motion), (row.view,)), pairs[0][1]))
-        if not asked:
-            continue
-        right = 0
-        for start in range(0, len(asked), 16):
-            chunk = asked[start : start + 16]
-            replies = model.reply(collator([example for example, _ in chunk], generation=True).to(model.device), 10)
-            right += sum(reply.strip() == answer for reply, (_, answer) in zip(replies, chunk, strict=True))
-        answers = [answer for _, answer in asked]
-        result[f"{kind}_accuracy"] = right / len(asked)
-        result[f"{kind}_majority"] = max(answers.count(a) for a in set(answers)) / len(asked)
+                asked.append(Example(looking([(question, "")], motion), (row.view,)))
+                answers.append(answer)
+        if asked:
+            result |= answer_shares(model, kind, asked, answers)
     result["asked_views"] = float(len(rows))
     return result
 
@@ -201,31 +195,20 @@ def exercise_accuracy(
     model: ProprioMLLM, exercises: Exercises, bodies: Bodies | None = None, limit: int = 200
 ) -> dict[str, float]:
     """Share of held-out exercises without pictures that the model's greedy reply repeats exactly; `bodies` adds motion."""
-    collator, rng = Collator(model.processor, model.cfg), np.random.default_rng(0)
-    order = exercises.test[:: max(1, len(exercises.test) // limit)][:limit]
-    exact = 0
-    for start in range(0, len(order), 16):
-        chunk = [int(i) for i in order[start : start + 16]]
-        asked = [exercises.example(i, False, exercises.motion(i, bodies, rng)) for i in chunk]
-        batch = collator(asked, generation=True).to(model.device)
-        replies = model.reply(batch, 40)
-        exact += sum(reply.strip() == exercises.target(i) for i, reply in zip(chunk, replies, strict=True))
+    rng = np.random.default_rng(0)
+    order = [int(i) for i in exercises.test[:: max(1, len(exercises.test) // limit)][:limit]]
+    said = replies(model, [exercises.example(i, rng, bodies, answered=False) for i in order], _LONGEST_STEP)
+    exact = sum(reply == exercises.target(i) for i, reply in zip(order, said, strict=True))
     return {"exercise_exact": exact / max(len(order), 1), "exercise_steps": float(len(order))}
 
 
 @torch.no_grad()
 def plan_accuracy(model: ProprioMLLM, demos: Demos, tokens: Any = None, limit: int = 200) -> dict[str, float]:
     """Share of held-out expert steps that the model's greedy reply repeats exactly, and whose action name it repeats."""
-    collator = Collator(model.processor, model.cfg)
     motion = None if tokens is None else demos.tokens(tokens)
-    order = demos.split.test[:limit]
-    exact = verb = 0
-    for start in range(0, len(order), 16):
-        chunk = [int(i) for i in order[start : start + 16]]
-        examples = [demos.example(i, None if motion is None else motion[i].tolist(), answered=False) for i in chunk]
-        batch = collator(examples, generation=True).to(model.device)
-        for index, reply in zip(chunk, model.reply(batch, 40), strict=True):
-            target = demos.target(index)
-            exact += reply.strip() == target
-            verb += reply.split("(")[0].strip() == target.split("(")[0]
+    order = [int(i) for i in demos.split.test[:limit]]
+    asked = [demos.example(i, None if motion is None else motion[i].tolist(), answered=False) for i in order]
+    pairs = [(reply, demos.target(i)) for i, reply in zip(order, replies(model, asked, _LONGEST_STEP), strict=True)]
+    exact = sum(reply == target for reply, target in pairs)
+    verb = sum(reply.split("(")[0].strip() == target.split("(")[0] for reply, target in pairs)
     return {"plan_exact": exact / max(len(order), 1), "plan_verb": verb / max(len(order), 1), "plan_steps": float(len(order))}

@@ -7,8 +7,7 @@ read its inputs only.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from data.records import HistoryItem
 from proprio_mllm.model.batch import Example
 from proprio_mllm.model.prompts import answers, critic_prompt, self_ask_prompt, with_answer
 from proprio_mllm.training.sources import Demos
-from proprio_mllm.training.states import states_from_log
+from proprio_mllm.training.states import asked_relation, history_of, states_from_log
 
 __all__ = ["LOG_LENGTH", "judge_example"]
 
@@ -44,7 +43,7 @@ def judge_example(demos: Demos, index: int, rng: np.random.Generator, tokens: ND
         index = int(rng.choice(demos.finals))
     row = demos.reader[int(index)]
     motion = None if tokens is None else tokens[int(index)].tolist()
-    history = _history(row)
+    history = history_of(row)
     if ended:
         history.append(HistoryItem(row["target"], "; ".join(f"{part.strip()} ok" for part in row["target"].split("&"))))
     if rng.random() < 0.5:
@@ -55,12 +54,6 @@ def judge_example(demos: Demos, index: int, rng: np.random.Generator, tokens: ND
         prompt = critic_prompt(goal, row["visible"], history, motion, style, LOG_LENGTH)
         return Example(with_answer(prompt, "yes" if done else "no"), (demos.view(row),))
     states = states_from_log(history[-LOG_LENGTH:])
-    full = [name for name, things in states.items() if things]
-    names = full if full and rng.random() < 0.7 else sorted(states)
-    relation = names[int(rng.integers(len(names)))]
+    relation = asked_relation(states, rng)
     prompt = self_ask_prompt(relation, row["visible"], history, motion, style, LOG_LENGTH)
     return Example(with_answer(prompt, answers(states[relation])), (demos.view(row),))
-
-
-def _history(row: Mapping[str, Any]) -> list[HistoryItem]:
-    return [HistoryItem(item["step"], item["feedback"]) for item in row["history"]]

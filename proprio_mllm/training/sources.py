@@ -12,6 +12,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from configs.schema.model import ModelConfig
 from data.motion import HAND_OPENING, KEY_BODY_COUNT, OPEN_HAND
-from data.records import Camera, HistoryItem
+from data.records import Camera
 from data.shards import Manifest, ShardError, ShardReader, decode_depth, decode_motion, decode_png, decode_segmentation
 from proprio_mllm.model.batch import Example, View
 from proprio_mllm.model.chat import Message
@@ -30,7 +31,7 @@ from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, answers, critic_prompt, named_prompt, plan_prompt, self_ask_prompt, with_answer
 from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
 from proprio_mllm.training.exercises import Exchange, is_symbolic
-from proprio_mllm.training.states import open_hands, states_from_log
+from proprio_mllm.training.states import asked_relation, history_of, open_hands, states_from_log
 
 __all__ = ["Bodies", "Clips", "Demos", "Exercises", "Judgements", "Views", "held_out", "shard_hash"]
 
@@ -158,7 +159,7 @@ def _planning(row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelCo
         row["robot"],
         row["visible"],
         row["known"],
-        [HistoryItem(item["step"], item["feedback"]) for item in row["history"]],
+        history_of(row),
         int(row["step"]),
         int(row["step_budget"]),
         motion,
@@ -167,9 +168,9 @@ def _planning(row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelCo
     )
 
 
-def _in_words(row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelConfig) -> list[Message]:
-    """The same without the picture."""
-    return [replace(message, images=0) for message in _planning(row, motion, cfg)]
+def _unpictured(prompt: Sequence[Message]) -> tuple[Message, ...]:
+    """The same prompt without the picture."""
+    return tuple(replace(message, images=0) for message in prompt)
 
 
 class _Joined:
@@ -240,7 +241,7 @@ class Demos:
         index = int(rng.choice(self._symbolic))
         exchanged = Exchange.draw(rng).row(self.reader[index])
         motion = None if bodies is None else bodies.row(index)
-        return Example(with_answer(_in_words(exchanged, motion, self._cfg), exchanged["target"]))
+        return Example(with_answer(_unpictured(_planning(exchanged, motion, self._cfg)), exchanged["target"]))
 
     def view(self, row: Mapping[str, Any]) -> View:
         """The head-camera view of a row."""
@@ -262,27 +263,29 @@ class Bodies:
 
     def __init__(self, demos: Demos, tokens: NDArray[np.int64]) -> None:
         self._tokens = tokens
+        self._rows: dict[tuple[str, bool, bool], NDArray[np.int64]] = {}
         robots = np.asarray(demos.reader.column("robot"))[demos.split.train]
         opened = demos.motions[demos.split.train, -1, HAND_OPENING] >= OPEN_HAND  # (N, 2)
-        self._rows: dict[tuple[str, bool, bool], NDArray[np.int64]] = {}
-        for robot in sorted(set(robots.tolist())):
-            for left in (False, True):
-                for right in (False, True):
-                    chosen = demos.split.train[(robots == robot) & (opened == (left, right)).all(axis=1)]
-                    self._rows[robot, left, right] = chosen
+        for robot, left, right in product(sorted(set(robots.tolist())), (False, True), (False, True)):
+            chosen = demos.split.train[(robots == robot) & (opened == (left, right)).all(axis=1)]
+            if len(chosen):
+                self._rows[robot, left, right] = chosen
+        #: Training rows of each robot with the same hands open.
+        self.grips = list(self._rows.values())
 
     def row(self, index: int) -> list[int]:
         """A recorded step's own motion tokens."""
         return self._tokens[index].tolist()
 
-    def draw(self, robot: str, left_open: bool, right_open: bool, rng: np.random.Generator) -> list[int] | None:
-        """Motion tokens of some recorded step; None when no row of this robot shows its hands so."""
-        rows = self._rows.get((robot, left_open, right_open), ())
-        return self.row(int(rng.choice(rows))) if len(rows) else None
+    def draw(self, row: Mapping[str, Any], rng: np.random.Generator) -> list[int] | None:
+        """Motion tokens for a step in words.
 
-    def grips(self) -> list[NDArray[np.int64]]:
-        """Training rows by robot and open hands, without empty groups."""
-        return [rows for rows in self._rows.values() if len(rows)]
+        None when its log is cut, so that its hands are not known, or when no recorded step shows its robot's hands so.
+        """
+        if len(row["history"]) < int(row["step"]):
+            return None
+        rows = self._rows.get((row["robot"], *open_hands(history_of(row))))
+        return None if rows is None else self.row(int(rng.choice(rows)))
 
 
 class Exercises:
@@ -311,15 +314,7 @@ class Exercises:
             return self._naming(index)
         if kind < FROM_LOGS + NAMING + STATES:
             return self._state(index, rng)
-        return self.example(index, motion=self.motion(index, bodies, rng))
-
-    def motion(self, index: int, bodies: Bodies | None, rng: np.random.Generator) -> list[int] | None:
-        """Motion for a row; None without `bodies`, or when the row's log is cut, so that its hands are not known."""
-        row = self.reader[int(index)]
-        if bodies is None or len(row["history"]) < int(row["step"]):
-            return None
-        opened = open_hands([HistoryItem(item["step"], item["feedback"]) for item in row["history"]])
-        return bodies.draw(row["robot"], *opened, rng)
+        return self.example(index, rng, bodies)
 
     def _naming(self, index: int) -> Example:
         row = self.reader[index]
@@ -328,19 +323,18 @@ class Exercises:
 
     def _state(self, index: int, rng: np.random.Generator) -> Example:
         row = self.reader[index]
-        history = [HistoryItem(item["step"], item["feedback"]) for item in row["history"]]
+        history = history_of(row)
         states = states_from_log(history)
-        full = [name for name, things in states.items() if things]
-        names = full if full and rng.random() < 0.7 else sorted(states)
-        relation = names[int(rng.integers(len(names)))]
+        relation = asked_relation(states, rng)
         prompt = self_ask_prompt(relation, row["visible"], history, None, self._cfg.prompt)
-        return Example(with_answer([replace(message, images=0) for message in prompt], answers(states[relation])))
+        return Example(with_answer(_unpictured(prompt), answers(states[relation])))
 
-    def example(self, index: int, answered: bool = True, motion: Sequence[int] | None = None) -> Example:
-        """One row's conversation."""
+    def example(self, index: int, rng: np.random.Generator, bodies: Bodies | None = None, answered: bool = True) -> Example:
+        """One row's conversation; `rng` draws the motion that `bodies` lends."""
         row = self.reader[int(index)]
-        prompt = _in_words(row, motion, self._cfg)
-        return Example(with_answer(prompt, row["target"]) if answered else tuple(prompt))
+        motion = None if bodies is None else bodies.draw(row, rng)
+        prompt = _unpictured(_planning(row, motion, self._cfg))
+        return Example(with_answer(prompt, row["target"]) if answered else prompt)
 
     def target(self, index: int) -> str:
         """The right step."""
@@ -357,9 +351,8 @@ class Judgements:
     def draw(self, rng: np.random.Generator) -> Example:
         """A conversation with its answer."""
         row = self.reader[int(rng.integers(len(self.reader)))]
-        history = [HistoryItem(item["step"], item["feedback"]) for item in row["history"]]
-        prompt = critic_prompt(row["instruction"], row["visible"], history, None, self._cfg.prompt)
-        return Example(with_answer([replace(message, images=0) for message in prompt], row["target"]))
+        prompt = critic_prompt(row["instruction"], row["visible"], history_of(row), None, self._cfg.prompt)
+        return Example(with_answer(_unpictured(prompt), row["target"]))
 
 
 class Clips:

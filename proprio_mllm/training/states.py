@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Final
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
 
 from data.records import Action, ActionError, HistoryItem
 
-__all__ = ["open_hands", "states_from_log"]
+__all__ = ["asked_relation", "history_of", "open_hands", "states_from_log"]
 
 _SWITCHES: Final = {"Open": "open", "Close": "closed", "ToggleOn": "switched on", "ToggleOff": "switched off", "Lift": "lifted"}
 _OPPOSITE: Final = {"open": "closed", "closed": "open", "switched on": "switched off", "switched off": "switched on"}
+
+
+def history_of(row: Mapping[str, Any]) -> list[HistoryItem]:
+    """The log of a shard's row."""
+    return [HistoryItem(item["step"], item["feedback"]) for item in row["history"]]
+
+
+def asked_relation(states: Mapping[str, Sequence[str]], rng: np.random.Generator) -> str:
+    """A relation to ask about; mostly one in which some object is."""
+    full = [name for name, things in states.items() if things]
+    names = full if full and rng.random() < 0.7 else sorted(states)
+    return names[int(rng.integers(len(names)))]
 
 
 def _successes(history: Sequence[HistoryItem]) -> Iterator[Action]:

@@ -110,15 +110,15 @@ def test_steps_in_words_get_motion_whose_hands_agree_with_the_log(shards: Path, 
     bodies = Bodies(demos, tokens)
     rng = np.random.default_rng(0)
     robot = demos.reader[int(demos.split.train[0])]["robot"]
-    assert bodies.draw(robot, True, True, rng) == tokens[demos.split.train[0]].tolist()
-    assert bodies.draw(robot, False, True, rng) is None
-    assert sum(len(rows) for rows in bodies.grips()) == len(demos.split.train)
+    empty = {"robot": robot, "step": 0, "history": []}
+    left_full = {"robot": robot, "step": 1, "history": [{"step": "", "feedback": "Pick(left, Mug_1) ok"}]}
+    assert bodies.draw(empty, rng) == tokens[demos.split.train[0]].tolist()
+    assert bodies.draw(left_full, rng) is None
+    assert sum(len(rows) for rows in bodies.grips) == len(demos.split.train)
     exercises = Exercises(shards / "exercises", cfg, demos)
     shown = [len(re.findall(r"<motion_\d+>", exercises.draw(rng, bodies).messages[1].text)) for _ in range(40)]
     assert {0, 4} <= set(shown)
     plain = [exercises.draw(rng).messages[1].text for _ in range(40)]
     assert not any("<motion" in text for text in plain)
     index = next(i for i in range(len(exercises.reader)) if len(exercises.reader[i]["history"]) == exercises.reader[i]["step"])
-    cut = {**exercises.reader[index], "step": 99}
-    exercises.reader = {index: cut}  # type: ignore[assignment]  # one row, as a reader would give it
-    assert exercises.motion(index, bodies, rng) is None
+    assert bodies.draw({**exercises.reader[index], "step": 99}, rng) is None
