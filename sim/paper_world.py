@@ -27,7 +27,7 @@ from sim.tasks.drafts import FAMILIES, Draft, NoDraft, Scene, category_of, draw
 from sim.tasks.jobs import Facts, Job, plan_jobs
 from sim.tasks.sample import rng_for, scene_of, typical_steps
 
-__all__ = ["Exercise", "exercises_of_part", "judgement", "judgements_of_part", "play"]
+__all__ = ["Exercise", "corrections_of_part", "exercises_of_part", "judgement", "judgements_of_part", "play"]
 
 #: Earlier steps that a row keeps.
 _HISTORY: Final = 8
@@ -53,6 +53,8 @@ _CONTAINERS: Final = ("Fridge", "Cabinet", "Drawer", "Microwave")
 _SWITCHES: Final = ("Faucet", "StoveKnob", "Microwave", "FloorLamp", "Television", "LightSwitch")
 _EXTRAS: Final = ("Sofa", "GarbageCan", "Chair", "TVStand", "SinkBasin")
 _FREE_ARMS: Final = (Arm.RIGHT, Arm.LEFT)
+#: What a learned planner does at each of several moments (rows of `exercises` without the target); None where it names no step.
+Student = Callable[[Sequence[Mapping[str, Any]]], Sequence[PlanStep | None]]
 
 
 @dataclass(slots=True)
@@ -79,53 +81,104 @@ def exercises_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, An
 
 
 def play(config: CollectConfig, index: int) -> Exercise:
-    """Plays one episode.
+    """Plays one episode with the expert's steps and drawn mistakes.
 
     Args:
         config: the collection.
         index: number of the episode; names every draw.
     """
-    rng = rng_for("exercises", config.seed, index)
-    robot = config.robots[index % len(config.robots)]
-    draft, scene = _draft(config, rng)
-    world = _PaperWorld(draft, scene, rng)
-    hidden = [name for name in draft.objects if name not in world.seen]
-    instruction = draft.sentences(scene.furniture, rng, hidden)[0]
-    budget = int(np.ceil(1.5 * typical_steps(draft.family))) + 2 + int(rng.choice((0, 0, 5, 10)))
-    mistakes = float(rng.choice(_MISTAKES))
-    exercise = Exercise()
-    history: list[dict[str, str]] = []
+    episode = _Episode(config, index, "exercises")
+    while (target := episode.ask()) is not None:
+        episode.take(episode.world.mistake(target) if episode.rng.random() < episode.mistakes else target)
+    return episode.close()
 
-    def moment(number: int) -> dict[str, Any]:
-        return {
+
+def corrections_of_part(config: CollectConfig, part: int, student: Student) -> Iterator[dict[str, Any]]:
+    """Rows of one part of an `exercises` folder whose steps a student chose and the expert corrected.
+
+    Args:
+        config: the collection; `noise` is the share of steps that the expert takes itself.
+        part: number of the part, whose episodes go side by side.
+        student: what the learned planner does at each of several moments; None where its reply is no step.
+    """
+    episodes = [_Episode(config, index, "corrected exercises") for index in config.indices(part)]
+    running = episodes
+    while asked := [(episode, target) for episode in running if (target := episode.ask()) is not None]:
+        proposals = student([episode.exercise.moments[-1] for episode, _ in asked])
+        for (episode, target), proposed in zip(asked, proposals, strict=True):
+            own = episode.rng.random() >= config.noise
+            usable = proposed is not None and proposed.actions[0].name != "Done" and not episode.refused(proposed)
+            episode.take(proposed if own and usable and proposed is not None else target)
+        running = [episode for episode, _ in asked]
+    for episode in episodes:
+        yield from episode.close().rows
+
+
+class _Episode:
+    """An episode under way.
+
+    Attributes:
+        rng: every draw of the episode, the world's too.
+        world: the facts.
+        mistakes: share of steps that are mistakes.
+        exercise: what has been recorded.
+    """
+
+    def __init__(self, config: CollectConfig, index: int, name: str) -> None:
+        self.rng = rng_for(name, config.seed, index)
+        draft, scene = _draft(config, self.rng)
+        self.world = _PaperWorld(draft, scene, self.rng)
+        hidden = [thing for thing in draft.objects if thing not in self.world.seen]
+        instruction = draft.sentences(scene.furniture, self.rng, hidden)[0]
+        self._budget = int(np.ceil(1.5 * typical_steps(draft.family))) + 2 + int(self.rng.choice((0, 0, 5, 10)))
+        self._last = min(self._budget, _MAX_STEPS)
+        self.mistakes = float(self.rng.choice(_MISTAKES))
+        self.exercise = Exercise()
+        self._history: list[dict[str, str]] = []
+        self._task = {
             "instruction": instruction,
-            "robot": robot,
+            "robot": config.robots[index % len(config.robots)],
             "category": category_of(draft.family),
-            "step": number,
-            "step_budget": budget,
-            "visible": list(world.visible),
-            "known": world.known(),
-            "history": history[-_HISTORY:],
+            "step_budget": self._budget,
             "named": list(draft.focus.values()),
         }
 
-    for number in range(min(budget, _MAX_STEPS)):
-        exercise.moments.append(moment(number))
-        answer = world.answer()
+    def ask(self) -> PlanStep | None:
+        """Records the moment; the expert's step there, None when the episode is over."""
+        number = len(self._history)
+        self.exercise.moments.append(
+            {
+                **self._task,
+                "step": number,
+                "visible": list(self.world.visible),
+                "known": self.world.known(),
+                "history": self._history[-_HISTORY:],
+            }
+        )
+        answer = self.world.answer() if number < self._last else None
         if answer is None:
-            break
+            return None
         target, justified = answer
         if justified:
-            exercise.rows.append({**exercise.moments[-1], "target": target.to_text()})
-        step = world.mistake(target) if rng.random() < mistakes else target
-        outcomes = [(action, world.act(action)) for action in step.actions]
-        exercise.codes |= {str(code) for _, code in outcomes}
+            self.exercise.rows.append({**self.exercise.moments[-1], "target": target.to_text()})
+        return target
+
+    def refused(self, step: PlanStep) -> bool:
+        """Whether a step is the one that has just failed."""
+        last = self._history[-1] if self._history else {"step": "", "feedback": " ok"}
+        return last["step"] == step.to_text() and not all(told.endswith(" ok") for told in last["feedback"].split("; "))
+
+    def take(self, step: PlanStep) -> None:
+        """Carries a step out."""
+        outcomes = [(action, self.world.act(action)) for action in step.actions]
+        self.exercise.codes |= {str(code) for _, code in outcomes}
         feedback = "; ".join(f"{action.to_text()} {code}" for action, code in outcomes)
-        history = [*history, {"step": step.to_text(), "feedback": feedback}]
-    else:
-        exercise.moments.append(moment(min(budget, _MAX_STEPS)))
-    exercise.success = world.answer() is None
-    return exercise
+        self._history.append({"step": step.to_text(), "feedback": feedback})
+
+    def close(self) -> Exercise:
+        """The record, with whether the goals hold."""
+        self.exercise.success = self.world.answer() is None
+        return self.exercise
 
 
 def judgements_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:

@@ -174,17 +174,20 @@ class CorrectionsConfig:
     """`stage=corrections`: the base model acts on training tasks, the expert names the right step in every state.
 
     Attributes:
-        episodes: episodes; those that do not end in success are dropped. 0 goes on without corrections.
+        episodes: episodes in the simulator; those that do not end in success are dropped. 0 goes on without these.
+        exercises: episodes in words alone; 0 goes on without these.
         expert_share: share of the steps that the expert takes itself, so that episodes get somewhere.
         workers: processes.
     """
 
     episodes: int = 0
+    exercises: int = 0
     expert_share: float = 0.25
     workers: int = 2
 
     def __post_init__(self) -> None:
-        _require(self.episodes >= 0, f"episodes {self.episodes} must not be negative")
+        for name in ("episodes", "exercises"):
+            _require(getattr(self, name) >= 0, f"{name} {getattr(self, name)} must not be negative")
         _require(self.workers > 0, f"workers {self.workers} must be positive")
         _require_shares(self, "expert_share")
 

@@ -1,8 +1,9 @@
 """Corrections (DAgger): a model acts on training tasks and the expert names the step it would have taken in each state.
 
 Demonstrations hardly show what follows a learned planner's own mistakes: placing with an empty hand, picking up what it holds,
-asking for an object it has not seen. The base model's mistakes, each with the expert's next step, join the demonstrations of
-stages 2 and 3. This is the bridge that `train.py` wires: training asks with a `CorrectionRequest` and reads `demos` shards.
+asking for an object it has not seen, going where it stands. The base model's mistakes, each with the expert's next step, join
+the demonstrations of stages 2 and 3, and those in words alone (`sim.paper_world`), which cost a fiftieth, the exercises. This
+is the bridge that `train.py` wires: training asks with a `CorrectionRequest` and reads `demos` or `exercises` shards.
 
 Part files are a function of the request and their number, so a run can be killed and continued. The paper has no such data; its
 pretrained backbone reads feedback in plain words already.
@@ -13,10 +14,10 @@ from __future__ import annotations
 import functools
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from tqdm import tqdm
 
@@ -26,27 +27,34 @@ from data.shards import ShardWriter
 from data.workers import start_worker
 from proprio_mllm.training.rollouts import CorrectionRequest
 
+if TYPE_CHECKING:
+    from proprio_mllm.planners.mllm import MllmPlanner
+
 __all__ = ["collect_corrections"]
 
-_PER_PART: Final = 10
+#: Episodes of a part; those in words go side by side.
+_PER_PART: Final[dict[str, int]] = {"demos": 10, "exercises": 50}
+#: Tokens of the longest planning step.
+_LONGEST_STEP: Final = 40
 
 
 def collect_corrections(request: CorrectionRequest, robots: Sequence[str] = ("h1", "x1"), workers: int = 2) -> None:
-    """Lets the model act and writes a complete `demos` folder; an interrupted one is continued part by part.
+    """Lets the model act and writes a complete shard folder; an interrupted one is continued part by part.
 
     Args:
         request: the model, how many episodes, and where they go.
         robots: robots, in turn.
         workers: processes; 1 stays in this one.
     """
-    writer = ShardWriter(request.folder, "demos", request.config_hash, overwrite=True)
+    writer = ShardWriter(request.folder, request.kind, request.config_hash, overwrite=True)
+    size = _PER_PART[request.kind]
     config = CollectConfig(
-        "demos", str(request.folder), request.episodes, tuple(robots), seed=request.seed, image_size=request.image_size,
-        part_size=_PER_PART, noise=request.expert_share,
+        request.kind, str(request.folder), request.episodes, tuple(robots), seed=request.seed, image_size=request.image_size,
+        part_size=size, noise=request.expert_share,
     )  # fmt: skip
-    count = -(-request.episodes // _PER_PART)
+    count = -(-request.episodes // size)
     missing = writer.missing(count)
-    with tqdm(total=count, initial=count - len(missing), desc="corrections", unit="part") as bar:
+    with tqdm(total=count, initial=count - len(missing), desc=f"corrections ({request.kind})", unit="part") as bar:
         for part, rows in _computed(config, missing, str(request.model), workers):
             writer.write(part, rows)
             bar.update(1)
@@ -70,6 +78,10 @@ def _computed(
 
 def _part(config: CollectConfig, part: int, model: str) -> list[dict[str, Any]]:
     """One part; imports simulator and model only here, so that workers start light."""
+    if config.kind == "exercises":
+        from sim.paper_world import corrections_of_part as in_words
+
+        return list(in_words(config, part, _reader(model)))
     os.environ.setdefault("MUJOCO_GL", "egl")
     from sim.demonstrations import corrections_of_part
 
@@ -77,15 +89,31 @@ def _part(config: CollectConfig, part: int, model: str) -> list[dict[str, Any]]:
 
 
 @functools.cache
-def _student(model: str) -> Callable[[Observation], PlanStep | None]:
+def _planner(model: str) -> MllmPlanner:
     import torch
 
     from proprio_mllm.planners.mllm import MllmPlanner
 
     torch.set_num_threads(1)
-    planner = MllmPlanner.load(Path(model))
+    return MllmPlanner.load(Path(model))
 
-    def step(observation: Observation) -> PlanStep | None:
-        return planner.step(observation, None).step
 
-    return step
+def _student(model: str) -> Callable[[Observation], PlanStep | None]:
+    """The model's step for what it sees."""
+    return lambda observation: _planner(model).step(observation, None).step
+
+
+def _reader(model: str) -> Callable[[Sequence[Mapping[str, Any]]], list[PlanStep | None]]:
+    """The model's steps for moments in words alone."""
+    from proprio_mllm.model.batch import Example
+    from proprio_mllm.planners.protocol import parse_reply
+    from proprio_mllm.training.asking import replies
+    from proprio_mllm.training.sources import step_in_words
+
+    reader = _planner(model).model
+
+    def steps(moments: Sequence[Mapping[str, Any]]) -> list[PlanStep | None]:
+        asked = [Example(step_in_words(moment, None, reader.cfg)) for moment in moments]
+        return [parse_reply(text).step for text in replies(reader, asked, _LONGEST_STEP)]
+
+    return steps

@@ -1,6 +1,6 @@
 """Where stages keep their outputs, and when an output is current.
 
-    <output>/<model>/data/{clips,views,exercises,demos,corrections}   shards, shared by all variants
+    <output>/<model>/data/{clips,views,exercises,demos,corrections,…}   shards, shared by all variants
     <output>/<model>/shared/{base,corrections,pointmap,tokenizer}
     <output>/<model>/<variant>/{alignment,selu}
 
@@ -33,7 +33,7 @@ class StagePaths:
         self.variant = cfg.variant
 
     def shards(self, kind: str) -> Path:
-        """Folder of the shards of a kind: `clips`, `views`, `exercises`, `demos` or `corrections`."""
+        """Folder of shards: `clips`, `views`, `exercises`, `judgements`, `demos`, `corrections` or `corrections_in_words`."""
         return self.root / "data" / kind
 
     def stage(self, name: str) -> Path:

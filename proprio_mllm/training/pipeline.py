@@ -13,7 +13,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
@@ -43,7 +43,7 @@ logger = logging.getLogger(__name__)
 Metrics = dict[str, float]
 
 #: Raised when what a stage trains on changes in code, so that older output is not taken for current.
-RECIPES: Final[Mapping[str, int]] = {"base": 2, "alignment": 3}
+RECIPES: Final[Mapping[str, int]] = {"base": 2, "alignment": 4}
 #: Stages whose current output a stage starts from.
 NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
     "corrections": ("base",),
@@ -110,8 +110,7 @@ class Pipeline:
             wanted = {"base": dataclasses.asdict(cfg.base), "model": plain, "recipe": RECIPES["base"]}
             return stage_key(wanted, cfg.seed, inputs)
         if name == "corrections":
-            wanted = {"episodes": cfg.corrections.episodes, "expert_share": cfg.corrections.expert_share}
-            return stage_key(wanted, cfg.seed, {"base": self.key("base")})
+            return stage_key(dict(self.corrections), cfg.seed, {"base": self.key("base")})
         if name == "pointmap":
             wanted = {"loop": dataclasses.asdict(cfg.pointmap), "map": dataclasses.asdict(cfg.model.point_map)}
             return stage_key(wanted, cfg.seed, {"views": shard_hash(shards("views"))})
@@ -161,15 +160,28 @@ class Pipeline:
 
     def demos(self, model: ModelConfig) -> Demos:
         """Demonstrations, and the corrections after them where there are any."""
-        folders = [self.paths.shards("demos")]
-        if self.corrected:
-            folders.append(self.paths.shards("corrections"))
-        return Demos(folders[0], model, folders[1:])
+        more = [self.paths.shards("corrections")] if "corrections" in self.corrections else []
+        return Demos(self.paths.shards("demos"), model, more)
+
+    def exercises(self, model: ModelConfig, demos: Demos) -> Exercises:
+        """Exercises in words, and the corrections in words after them where there are any."""
+        kind = "corrections_in_words"
+        more = [self.paths.shards(kind)] if kind in self.corrections else []
+        return Exercises(self.paths.shards("exercises"), model, demos, more)
 
     @property
-    def corrected(self) -> bool:
-        """Whether this configuration has corrections: there must be a base model of its own to correct."""
-        return self.cfg.corrections.episodes > 0 and self.cfg.model.weights is None
+    def corrections(self) -> Mapping[str, str]:
+        """Key of each folder of corrections; none without a base model of this configuration's own to correct."""
+        cfg = self.cfg.corrections
+        if self.cfg.model.weights is not None:
+            return {}
+        counts = {"corrections": {"episodes": cfg.episodes}, "corrections_in_words": {"exercises": cfg.exercises}}
+        inputs = {"base": self.key("base")}
+        return {
+            name: stage_key({**count, "expert_share": cfg.expert_share}, self.cfg.seed, inputs)
+            for name, count in counts.items()
+            if all(count.values())
+        }
 
     # ---- stages -------------------------------------------------------------------------------------------------------------
 
@@ -196,29 +208,38 @@ class Pipeline:
         return {**asked, **plan_accuracy(model, demos), **exercise_accuracy(model, exercises)}
 
     def _corrections(self, folder: Path, key: str) -> Metrics:
-        cfg = self.cfg.corrections
-        if not self.corrected:
+        del key
+        if not self.corrections:
             logger.info("corrections: none asked for, or no base model of this project's own")
             return {}
+        cfg, metrics = self.cfg.corrections, Metrics()
+        if "corrections" in self.corrections:
+            reader = self._corrected("corrections", "demos", cfg.episodes)
+            notes = [json.loads(text) for text in reader.column("privileged")]
+            acted = zip(notes, reader.column("target"), strict=True)
+            own = [note["executed"] == target for note, target in acted if note["origin"] == "student"]
+            metrics |= {
+                "episodes": float(cfg.episodes),
+                "kept_episodes": float(len(set(reader.column("episode")))),
+                "steps": float(len(notes)),
+                "student_steps": float(len(own)),
+                "student_as_expert": float(np.mean(own)) if own else 0.0,
+            }
+        if "corrections_in_words" in self.corrections:
+            reader = self._corrected("corrections_in_words", "exercises", cfg.exercises)
+            metrics |= {"exercises": float(cfg.exercises), "exercise_steps": float(len(reader))}
+        return metrics
+
+    def _corrected(self, name: str, kind: Literal["demos", "exercises"], episodes: int) -> ShardReader:
+        """The shards of one folder of corrections, written by the collector where they are missing."""
         if self._correct is None:
             raise ValueError("stage 'corrections' needs the simulator: no collector was given")
-        shards = self.paths.shards("corrections")
-        size = self.cfg.model.image_size
-        request = CorrectionRequest(
-            self.paths.model("base"), shards, cfg.episodes, self.cfg.seed, cfg.expert_share, size, config_hash({"key": key})
-        )
+        cfg, shards = self.cfg.corrections, self.paths.shards(name)
+        written = config_hash({"key": self.corrections[name]})
+        size, seed = self.cfg.model.image_size, self.cfg.seed
+        request = CorrectionRequest(self.paths.model("base"), shards, kind, episodes, seed, cfg.expert_share, size, written)
         self._correct(request, workers=cfg.workers)
-        reader = ShardReader(shards, "demos")
-        notes = [json.loads(text) for text in reader.column("privileged")]
-        acted = zip(notes, reader.column("target"), strict=True)
-        own = [note["executed"] == target for note, target in acted if note["origin"] == "student"]
-        return {
-            "episodes": float(cfg.episodes),
-            "kept_episodes": float(len(set(reader.column("episode")))),
-            "steps": float(len(notes)),
-            "student_steps": float(len(own)),
-            "student_as_expert": float(np.mean(own)) if own else 0.0,
-        }
+        return ShardReader(shards, kind)
 
     def _train_dense(self, objective: DenseObjective, model: ProprioMLLM, head: DenseHead, folder: Path) -> None:
         chosen = {id(p) for p in train_only(model, ("vision", "merger", "rows"))} | {id(p) for p in head.parameters()}
@@ -272,7 +293,7 @@ class Pipeline:
         model = self._start_alignment()
         tokenizer = MotionTokenizer.load(self.paths.model("tokenizer"))
         views, demos = Views(self.paths.shards("views"), model.cfg), self.demos(model.cfg)
-        exercises = Exercises(self.paths.shards("exercises"), model.cfg, demos)
+        exercises = self.exercises(model.cfg, demos)
         judgements = Judgements(self.paths.shards("judgements"), model.cfg)
         clips = Clips(self.paths.shards("clips"))
         data = AlignmentData(model, tokenizer, clips, views, demos, exercises, judgements, self.cfg.alignment)

@@ -99,7 +99,7 @@ def _shrink(folder: Path) -> None:
 
 def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
     shards = {}
-    for kind in ("clips", "views", "exercises", "judgements", "demos", "corrections"):
+    for kind in ("clips", "views", "exercises", "judgements", "demos", "corrections", "corrections_in_words"):
         folder = pipeline.paths.shards(kind)
         if (folder / "manifest.json").is_file():
             shards[kind] = shard_hash(folder)

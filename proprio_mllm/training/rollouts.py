@@ -15,7 +15,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +55,9 @@ class CorrectionRequest:
 
     Attributes:
         model: folder of the model that acts.
-        folder: shard folder to write, kind `demos`.
-        episodes: number of episodes; those that do not end in success are dropped.
+        folder: shard folder to write.
+        kind: `demos` in the simulator, where episodes that do not end in success are dropped, or `exercises` in words alone.
+        episodes: number of episodes.
         seed: of tasks and draws.
         expert_share: share of the steps that the expert takes itself.
         image_size: side of the pictures, pixels.
@@ -65,6 +66,7 @@ class CorrectionRequest:
 
     model: Path
     folder: Path
+    kind: Literal["demos", "exercises"]
     episodes: int
     seed: int
     expert_share: float

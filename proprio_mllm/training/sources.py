@@ -33,7 +33,7 @@ from proprio_mllm.model.questions import arm_answer, ask, distance_answer, heigh
 from proprio_mllm.training.exercises import Exchange, is_symbolic
 from proprio_mllm.training.states import asked_relation, history_of, open_hands, states_from_log
 
-__all__ = ["Bodies", "Clips", "Demos", "Exercises", "Judgements", "Views", "held_out", "shard_hash"]
+__all__ = ["Bodies", "Clips", "Demos", "Exercises", "Judgements", "Views", "held_out", "shard_hash", "step_in_words"]
 
 #: One in this many views, episodes and clips is never trained on.
 HELD_OUT = 20
@@ -168,6 +168,11 @@ def _planning(row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelCo
     )
 
 
+def step_in_words(row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelConfig) -> tuple[Message, ...]:
+    """The planner's prompt of a row without its picture."""
+    return _unpictured(_planning(row, motion, cfg))
+
+
 def _unpictured(prompt: Sequence[Message]) -> tuple[Message, ...]:
     """The same prompt without the picture."""
     return tuple(replace(message, images=0) for message in prompt)
@@ -241,7 +246,7 @@ class Demos:
         index = int(rng.choice(self._symbolic))
         exchanged = Exchange.draw(rng).row(self.reader[index])
         motion = None if bodies is None else bodies.row(index)
-        return Example(with_answer(_unpictured(_planning(exchanged, motion, self._cfg)), exchanged["target"]))
+        return Example(with_answer(step_in_words(exchanged, motion, self._cfg), exchanged["target"]))
 
     def view(self, row: Mapping[str, Any]) -> View:
         """The head-camera view of a row."""
@@ -295,10 +300,12 @@ class Exercises:
         folder: `exercises` shards.
         cfg: the model's.
         demos: the logs.
+        more: further folders of the same kind (corrections in words), each drawn as often as the first.
     """
 
-    def __init__(self, folder: Path, cfg: ModelConfig, demos: Demos) -> None:
+    def __init__(self, folder: Path, cfg: ModelConfig, demos: Demos, more: Sequence[Path] = ()) -> None:
         self.reader = ShardReader(folder, "exercises")
+        self._more = [ShardReader(one, "exercises") for one in more]
         self._cfg, self._demos = cfg, demos
         # rows of an episode stand together: the last ones are held out
         self._train = len(self.reader) - len(self.reader) // HELD_OUT
@@ -314,6 +321,10 @@ class Exercises:
             return self._naming(index)
         if kind < FROM_LOGS + NAMING + STATES:
             return self._state(index, rng)
+        which = int(rng.integers(1 + len(self._more))) if self._more else 0
+        if which:
+            reader = self._more[which - 1]
+            return self._step(reader[int(rng.integers(len(reader)))], rng, bodies, True)
         return self.example(index, rng, bodies)
 
     def _naming(self, index: int) -> Example:
@@ -331,9 +342,10 @@ class Exercises:
 
     def example(self, index: int, rng: np.random.Generator, bodies: Bodies | None = None, answered: bool = True) -> Example:
         """One row's conversation; `rng` draws the motion that `bodies` lends."""
-        row = self.reader[int(index)]
-        motion = None if bodies is None else bodies.draw(row, rng)
-        prompt = _unpictured(_planning(row, motion, self._cfg))
+        return self._step(self.reader[int(index)], rng, bodies, answered)
+
+    def _step(self, row: Mapping[str, Any], rng: np.random.Generator, bodies: Bodies | None, answered: bool) -> Example:
+        prompt = step_in_words(row, None if bodies is None else bodies.draw(row, rng), self._cfg)
         return Example(with_answer(prompt, row["target"]) if answered else prompt)
 
     def target(self, index: int) -> str:

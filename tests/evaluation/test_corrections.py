@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from configs.schema.collect import CollectConfig
 from data.records import Observation, PlanStep
 from data.shards import ShardReader
 from proprio_mllm.evaluation import corrections
@@ -19,14 +24,14 @@ def request_(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CorrectionReque
         return PlanStep.parse(f"GoTo({observation.known_objects[-1]})")
 
     monkeypatch.setattr(corrections, "_student", lambda model: student)
-    monkeypatch.setattr(corrections, "_PER_PART", 2)
-    return CorrectionRequest(tmp_path / "model", tmp_path / "corrections", 4, 0, 0.5, 56, "hash")
+    monkeypatch.setattr(corrections, "_PER_PART", {"demos": 2, "exercises": 2})
+    return CorrectionRequest(tmp_path / "model", tmp_path / "corrections", "demos", 4, 0, 0.5, 56, "hash")
 
 
 def test_an_interrupted_run_continues_to_the_same_rows(
     request_: CorrectionRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = CorrectionRequest(request_.model, tmp_path / "whole", 4, 0, 0.5, 56, "hash")
+    whole = CorrectionRequest(request_.model, tmp_path / "whole", "demos", 4, 0, 0.5, 56, "hash")
     collect_corrections(whole, workers=1)
     part, calls = corrections._part, []
 
@@ -49,3 +54,32 @@ def test_an_interrupted_run_continues_to_the_same_rows(
     assert one.column("image") == other.column("image")
     assert {"h1"} <= set(one.column("robot")) <= {"h1", "x1"}
     assert one.manifest.metadata["expert_share"] == 0.5
+
+
+@pytest.fixture
+def in_words(request_: CorrectionRequest, monkeypatch: pytest.MonkeyPatch) -> CorrectionRequest:
+    def reader(moments: Sequence[Mapping[str, Any]]) -> list[PlanStep | None]:
+        return [None if moment["step"] % 3 == 2 else PlanStep.parse(f"Pick(left, {moment['known'][-1]})") for moment in moments]
+
+    monkeypatch.setattr(corrections, "_reader", lambda model: reader)
+    return dataclasses.replace(request_, kind="exercises", episodes=6)
+
+
+def test_corrections_in_words_are_exercises(in_words: CorrectionRequest) -> None:
+    collect_corrections(in_words, workers=1)
+    reader = ShardReader(in_words.folder, "exercises")
+    rows = [reader[i] for i in range(len(reader))]
+    logs = [item["step"] for row in rows for item in row["history"]]
+    assert any(step.startswith("Pick(left, ") for step in logs)
+    assert all(PlanStep.parse(row["target"]).to_text() == row["target"] for row in rows)
+    # what the student does again after a refusal, the expert does
+    for row in rows:
+        for before, after in pairwise(row["history"]):
+            assert before["feedback"].endswith(" ok") or before["step"] != after["step"] or after["step"] == row["target"]
+
+
+def test_the_expert_alone_solves_episodes_in_words(in_words: CorrectionRequest) -> None:
+    config = CollectConfig("exercises", "unused", 6, part_size=6, noise=1.0)
+    rows = corrections._part(config, 0, "unused")
+    assert rows == corrections._part(config, 0, "unused")
+    assert not [item for row in rows for item in row["history"] if item["feedback"].endswith(("HandOccupied", "HandEmpty"))]

@@ -57,7 +57,7 @@ def test_judgements_are_balanced_and_true(episodes: list[Exercise]) -> None:
     assert len(rows) == 300
     assert 0.4 < sum(row["target"] == "yes" for row in rows) / len(rows) < 0.6
     for episode, row in zip(episodes, rows, strict=True):
-        ends = episode.moments[-1].columns
+        ends = episode.moments[-1]
         if row["target"] == "yes":
             assert episode.success
             assert row["instruction"] == ends["instruction"]
