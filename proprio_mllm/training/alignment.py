@@ -11,7 +11,8 @@ other's pairs train. Besides clip captions, motion and image to text holds quest
 (which arm reaches an object, how far the body must go down), and motion to text asks which hands are open and how high the
 pelvis is, which captions do not say and planning needs. A share of planning demonstrations, with motion tokens in the prompt,
 keeps the planner's format, and exercises in words, now with motion that agrees with their log, keep what the base stage
-learnt from them; the paper does not mention any such replay. Corrections (`stage=corrections`) count as demonstrations here.
+learnt from them; the paper does not mention any such replay. Corrections (`stage=corrections`) count as demonstrations and as
+exercises here.
 
 The control `variant=no_proprio` has the joint phase alone, and of its pairs those that need no motion.
 """

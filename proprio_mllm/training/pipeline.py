@@ -164,10 +164,10 @@ class Pipeline:
         return Demos(self.paths.shards("demos"), model, more)
 
     def exercises(self, model: ModelConfig, demos: Demos) -> Exercises:
-        """Exercises in words, and the corrections in words after them where there are any."""
+        """Exercises in words, and the corrections in words among them where there are any."""
         kind = "corrections_in_words"
-        more = [self.paths.shards(kind)] if kind in self.corrections else []
-        return Exercises(self.paths.shards("exercises"), model, demos, more)
+        corrected = self.paths.shards(kind) if kind in self.corrections else None
+        return Exercises(self.paths.shards("exercises"), model, demos, corrected)
 
     @property
     def corrections(self) -> Mapping[str, str]:

@@ -42,6 +42,8 @@ BODY_RELATIVE = ("arm", "shift")
 #: Shares of exercises: the expert's own logs with names exchanged, which objects an instruction names, which objects are in a
 #: state according to the log. The others ask for the next step of an episode in words.
 FROM_LOGS, NAMING, STATES = 0.2, 0.2, 0.1
+#: Share of corrections among the exercises where there are any.
+CORRECTED = 0.5
 
 
 def held_out(key: str) -> bool:
@@ -300,12 +302,12 @@ class Exercises:
         folder: `exercises` shards.
         cfg: the model's.
         demos: the logs.
-        more: further folders of the same kind (corrections in words), each drawn as often as the first.
+        corrected: shards of the same kind, corrections in words; None leaves them out.
     """
 
-    def __init__(self, folder: Path, cfg: ModelConfig, demos: Demos, more: Sequence[Path] = ()) -> None:
+    def __init__(self, folder: Path, cfg: ModelConfig, demos: Demos, corrected: Path | None = None) -> None:
         self.reader = ShardReader(folder, "exercises")
-        self._more = [ShardReader(one, "exercises") for one in more]
+        self._corrected = None if corrected is None else ShardReader(corrected, "exercises")
         self._cfg, self._demos = cfg, demos
         # rows of an episode stand together: the last ones are held out
         self._train = len(self.reader) - len(self.reader) // HELD_OUT
@@ -313,6 +315,8 @@ class Exercises:
 
     def draw(self, rng: np.random.Generator, bodies: Bodies | None = None) -> Example:
         """A training example; with `bodies` steps get motion whose hands agree with the log."""
+        if self._corrected is not None and rng.random() < CORRECTED:
+            return self._step(self._corrected[int(rng.integers(len(self._corrected)))], rng, bodies, True)
         kind = rng.random()
         if kind < FROM_LOGS:
             return self._demos.exercise(rng, bodies)
@@ -321,10 +325,6 @@ class Exercises:
             return self._naming(index)
         if kind < FROM_LOGS + NAMING + STATES:
             return self._state(index, rng)
-        which = int(rng.integers(1 + len(self._more))) if self._more else 0
-        if which:
-            reader = self._more[which - 1]
-            return self._step(reader[int(rng.integers(len(reader)))], rng, bodies, True)
         return self.example(index, rng, bodies)
 
     def _naming(self, index: int) -> Example:

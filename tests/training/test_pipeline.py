@@ -26,7 +26,7 @@ from proprio_mllm.training.alignment import PHASES, AlignmentObjective
 from proprio_mllm.training.pipeline import STAGES, Pipeline, StageError, variant_model
 from proprio_mllm.training.rollouts import CorrectionRequest, RolloutRequest, read_rollouts, rollout_row
 from proprio_mllm.training.selu import CRITIC, copy_adapter, train_adapter
-from proprio_mllm.training.sources import Demos, shard_hash
+from proprio_mllm.training.sources import Demos, Exercises, shard_hash
 
 HELPERS = importlib.util.spec_from_file_location("training_helpers", Path(__file__).with_name("conftest.py"))
 assert HELPERS is not None
@@ -67,14 +67,17 @@ def collect(request: RolloutRequest) -> None:
 def correct(request: CorrectionRequest, workers: int) -> None:
     """Scripted corrections in place of the simulator: a student that is right on every second of its steps."""
     assert workers > 0
-    source = ShardReader(request.folder.parent / "demos", "demos")
+    source = ShardReader(request.folder.parent / request.kind, request.kind)
     rows = []
     for number in range(12):
         row = dict(source[number])
+        if request.kind == "exercises":
+            rows.append({**row, "target": "Lift(Box_1)"})
+            continue
         executed = row["target"] if number % 2 else "MoveAhead(0.5)"
         note = {"executed": executed, "origin": "student" if number < 8 else "expert"}
         rows.append({**row, "episode": f"corrected{number // 3}", "privileged": json.dumps(note)})
-    writer = ShardWriter(request.folder, "demos", request.config_hash, overwrite=True)
+    writer = ShardWriter(request.folder, request.kind, request.config_hash, overwrite=True)
     writer.write(0, rows)
     writer.finish({})
 
@@ -145,7 +148,8 @@ def test_metrics_are_reported(trained: Pipeline) -> None:
 
     assert {"side_accuracy", "side_majority", "plan_exact", "exercise_exact", "base/joint/steps"} <= set(metrics("base"))
     assert metrics("corrections") | {"seconds": 0} == {
-        "episodes": 4.0, "kept_episodes": 4.0, "steps": 12.0, "student_steps": 8.0, "student_as_expert": 0.5, "seconds": 0,
+        "episodes": 4.0, "kept_episodes": 4.0, "steps": 12.0, "student_steps": 8.0, "student_as_expert": 0.5,
+        "exercises": 10.0, "exercise_steps": 12.0, "seconds": 0,
     }  # fmt: skip
     assert metrics("pointmap")["point_median_m"] > 0.0
     assert {"clips_mpjpe_mm", "clips_hands_feet_mm", "codes_used", "perplexity"} <= set(metrics("tokenizer"))
@@ -162,6 +166,21 @@ def test_corrections_follow_the_demonstrations(trained: Pipeline) -> None:
     assert {joined.reader[i]["episode"] for i in joined.finals} > {alone.reader[i]["episode"] for i in alone.finals}
     none = dataclasses.replace(trained.cfg, corrections=dataclasses.replace(trained.cfg.corrections, episodes=0))
     assert len(Pipeline(none).demos(model).motions) == count
+    assert list(Pipeline(none).corrections) == ["corrections_in_words"]
+
+
+def test_half_of_the_steps_in_words_are_corrections(trained: Pipeline) -> None:
+    model, rng = trained.cfg.model, np.random.default_rng(0)
+    demos = Demos(trained.paths.shards("demos"), model)
+
+    def answers(exercises: Exercises) -> list[str]:
+        return [exercises.draw(rng).messages[-1].text for _ in range(200)]
+
+    assert 70 < answers(trained.exercises(model, demos)).count("Lift(Box_1)") < 130
+    assert answers(Exercises(trained.paths.shards("exercises"), model, demos)).count("Lift(Box_1)") < 10
+    alone = dataclasses.replace(trained.cfg, corrections=dataclasses.replace(trained.cfg.corrections, exercises=0))
+    assert Pipeline(alone).key("alignment") != trained.key("alignment")
+    assert Pipeline(alone).corrections["corrections"] == trained.corrections["corrections"]
 
 
 def test_the_control_trains_without_motion(trained: Pipeline) -> None:
@@ -248,7 +267,7 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
     assert list(about["stages"]) == ["base", "corrections", "pointmap", "tokenizer", "alignment", "selu"]
     assert all(stage["command"] == "python train.py stage=all" and stage["metrics"] for stage in about["stages"].values())
-    assert set(about["shards"]) == {"clips", "views", "exercises", "judgements", "demos", "corrections"}
+    assert set(about["shards"]) == {"clips", "views", "exercises", "judgements", "demos", "corrections", "corrections_in_words"}
     ours, released = load_model(trained.paths.model("selu")), load_model(tmp_path / "tiny" / "full")
     theirs = dict(released.named_parameters())
     assert all(tensor.dtype == torch.float32 for tensor in theirs.values())
