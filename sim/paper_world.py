@@ -27,7 +27,7 @@ from sim.tasks.drafts import FAMILIES, Draft, NoDraft, Scene, category_of, draw
 from sim.tasks.jobs import Facts, Job, plan_jobs
 from sim.tasks.sample import rng_for, scene_of, typical_steps
 
-__all__ = ["Exercise", "corrections_of_part", "exercises_of_part", "judgement", "judgements_of_part", "play"]
+__all__ = ["Exercise", "corrections_of_part", "exercises_of_part", "judgement", "judgements_of_part", "play", "play_alone"]
 
 #: Earlier steps that a row keeps.
 _HISTORY: Final = 8
@@ -97,21 +97,44 @@ def corrections_of_part(config: CollectConfig, part: int, student: Student) -> I
     """Rows of one part of an `exercises` folder whose steps a student chose and the expert corrected.
 
     Args:
-        config: the collection; `noise` is the share of steps that the expert takes itself.
+        config: the collection; `noise` is the share of steps that the expert takes itself, besides those in which the student
+            has no step, ends the task, or does again what has just been refused.
         part: number of the part, whose episodes go side by side.
-        student: what the learned planner does at each of several moments; None where its reply is no step.
+        student: the learned planner.
     """
+
+    def chosen(episode: _Episode, target: PlanStep, proposed: PlanStep | None) -> PlanStep:
+        own = episode.rng.random() >= config.noise
+        usable = proposed is not None and proposed.actions[0].name != "Done" and not episode.refused(proposed)
+        return proposed if own and usable and proposed is not None else target
+
     episodes = [_Episode(config, index, "corrected exercises") for index in config.indices(part)]
-    running = episodes
+    for episode in _side_by_side(episodes, student, chosen):
+        yield from episode.rows
+
+
+def play_alone(config: CollectConfig, student: Student) -> list[Exercise]:
+    """Plays every episode of a collection side by side with a student that nobody helps; a reply without a step does nothing.
+
+    Measures what a planner makes of words alone, apart from the benchmark's tasks: for choosing between training recipes.
+    """
+    episodes = [_Episode(config, index, "held-out exercises") for index in range(config.count)]
+    return _side_by_side(episodes, student, lambda episode, target, proposed: proposed)
+
+
+def _side_by_side(
+    episodes: Sequence[_Episode],
+    student: Student,
+    choose: Callable[[_Episode, PlanStep, PlanStep | None], PlanStep | None],
+) -> list[Exercise]:
+    """Plays episodes to their ends, the student answering for all that still run at once."""
+    running = list(episodes)
     while asked := [(episode, target) for episode in running if (target := episode.ask()) is not None]:
         proposals = student([episode.exercise.moments[-1] for episode, _ in asked])
         for (episode, target), proposed in zip(asked, proposals, strict=True):
-            own = episode.rng.random() >= config.noise
-            usable = proposed is not None and proposed.actions[0].name != "Done" and not episode.refused(proposed)
-            episode.take(proposed if own and usable and proposed is not None else target)
+            episode.take(choose(episode, target, proposed))
         running = [episode for episode, _ in asked]
-    for episode in episodes:
-        yield from episode.close().rows
+    return [episode.close() for episode in episodes]
 
 
 class _Episode:
@@ -168,8 +191,11 @@ class _Episode:
         last = self._history[-1] if self._history else {"step": "", "feedback": " ok"}
         return last["step"] == step.to_text() and not all(told.endswith(" ok") for told in last["feedback"].split("; "))
 
-    def take(self, step: PlanStep) -> None:
-        """Carries a step out."""
+    def take(self, step: PlanStep | None) -> None:
+        """Carries a step out; None is a reply that names none."""
+        if step is None:
+            self._history.append({"step": "", "feedback": "InvalidOutput"})
+            return
         outcomes = [(action, self.world.act(action)) for action in step.actions]
         self.exercise.codes |= {str(code) for _, code in outcomes}
         feedback = "; ".join(f"{action.to_text()} {code}" for action, code in outcomes)

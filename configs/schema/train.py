@@ -44,13 +44,14 @@ class LoopConfig:
         batch: examples per step and process.
         lr: peak learning rate, reached after `warmup` steps, then a cosine down to a tenth of it.
         warmup: steps of linear warm-up.
-        weight_decay: AdamW's, on matrices only.
+        weight_decay: on matrices only.
         clip: largest gradient norm.
         checkpoint_every: steps between checkpoints.
         log_every: steps between log lines.
         minutes: time budget over all resumed parts; the schedule then follows whichever of steps and time is further, so
             results depend on the machine's speed. 0 means steps alone count.
         precision: `bf16` computes under autocast, parameters stay as they are.
+        optimizer: `adamw`, or `muon` for the weights of linear layers with AdamW for the rest.
     """
 
     steps: int
@@ -63,6 +64,7 @@ class LoopConfig:
     log_every: int = 20
     minutes: float = 0.0
     precision: Literal["fp32", "bf16"] = "fp32"
+    optimizer: Literal["adamw", "muon"] = "adamw"
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "checkpoint_every", "log_every"):

@@ -30,7 +30,7 @@ from proprio_mllm.training.rollouts import CorrectionRequest
 if TYPE_CHECKING:
     from proprio_mllm.planners.mllm import MllmPlanner
 
-__all__ = ["collect_corrections"]
+__all__ = ["collect_corrections", "student_in_words"]
 
 #: Episodes of a part; those in words go side by side.
 _PER_PART: Final[dict[str, int]] = {"demos": 10, "exercises": 50}
@@ -81,7 +81,7 @@ def _part(config: CollectConfig, part: int, model: str) -> list[dict[str, Any]]:
     if config.kind == "exercises":
         from sim.paper_world import corrections_of_part as in_words
 
-        return list(in_words(config, part, _reader(model)))
+        return list(in_words(config, part, student_in_words(model)))
     os.environ.setdefault("MUJOCO_GL", "egl")
     from sim.demonstrations import corrections_of_part
 
@@ -103,8 +103,8 @@ def _student(model: str) -> Callable[[Observation], PlanStep | None]:
     return lambda observation: _planner(model).step(observation, None).step
 
 
-def _reader(model: str) -> Callable[[Sequence[Mapping[str, Any]]], list[PlanStep | None]]:
-    """The model's steps for moments in words alone."""
+def student_in_words(model: str) -> Callable[[Sequence[Mapping[str, Any]]], list[PlanStep | None]]:
+    """The model in a folder as a student of `sim.paper_world`: its greedy steps for moments in words, without motion."""
     from proprio_mllm.model.batch import Example
     from proprio_mllm.planners.protocol import parse_reply
     from proprio_mllm.training.asking import replies

@@ -27,7 +27,7 @@ def save_checkpoint(
         folder: replaced as a whole.
         step: steps taken.
         module: its trainable parameters and all buffers are stored.
-        optimizer: AdamW over those parameters.
+        optimizer: over those parameters.
         key: identifies the run; a checkpoint of another key is not loaded.
         seconds: time spent so far.
     """

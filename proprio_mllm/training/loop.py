@@ -1,4 +1,4 @@
-"""The one training loop: seeded batches, AdamW, cosine schedule, checkpoints, metrics, progress with time left.
+"""The one training loop: seeded batches, AdamW or Muon, cosine schedule, checkpoints, metrics, progress with time left.
 
 A stage gives an `Objective`: which module trains, the batch of a step, and its loss. The batch of a step is a function of
 (seed, step, process) only, so a run that is killed and resumed ends with the same weights as one that was not. accelerate
@@ -25,8 +25,9 @@ from tqdm import tqdm
 from configs.schema.train import LoopConfig
 from proprio_mllm.training.checkpoint import load_checkpoint, save_checkpoint
 from proprio_mllm.training.metrics import MetricWriter
+from proprio_mllm.training.muon import Muon, linear_weights
 
-__all__ = ["LoopResult", "Objective", "run_loop"]
+__all__ = ["LoopResult", "Objective", "learning_rate", "make_optimizer", "run_loop"]
 
 logger = logging.getLogger(__name__)
 
@@ -81,6 +82,22 @@ def _moved(batch: Any, device: torch.device) -> Any:
     return batch.to(device) if hasattr(batch, "to") and device.type != "cpu" else batch
 
 
+def make_optimizer(module: nn.Module, cfg: LoopConfig) -> torch.optim.Optimizer:
+    """The configured optimiser over a module's trained parameters; weight decay on matrices only."""
+    trained = [parameter for parameter in module.parameters() if parameter.requires_grad]
+    matrices = linear_weights(module) if cfg.optimizer == "muon" else []
+    taken = {id(parameter) for parameter in matrices}
+    others = [parameter for parameter in trained if id(parameter) not in taken]
+    groups = [
+        {"params": [p for p in others if p.ndim >= 2], "weight_decay": cfg.weight_decay},
+        {"params": [p for p in others if p.ndim < 2], "weight_decay": 0.0},
+    ]
+    groups = [group for group in groups if group["params"]]
+    if matrices:
+        return Muon(matrices, groups, cfg.lr, weight_decay=cfg.weight_decay)
+    return torch.optim.AdamW(groups, lr=cfg.lr, betas=(0.9, 0.99))
+
+
 def run_loop(
     objective: Objective, cfg: LoopConfig, folder: Path, seed: int, writer: MetricWriter, resume: bool = True
 ) -> LoopResult:
@@ -94,11 +111,7 @@ def run_loop(
     trained = [parameter for parameter in source.parameters() if parameter.requires_grad]
     if not trained:
         raise ValueError(f"stage {objective.name!r} trains no parameter")
-    groups = [
-        {"params": [p for p in trained if p.ndim >= 2], "weight_decay": cfg.weight_decay},
-        {"params": [p for p in trained if p.ndim < 2], "weight_decay": 0.0},
-    ]
-    optimizer = torch.optim.AdamW([group for group in groups if group["params"]], lr=cfg.lr, betas=(0.9, 0.99))
+    optimizer = make_optimizer(source, cfg)
     module, prepared = accelerator.prepare(source, optimizer)
     checkpoint = folder / "checkpoint"
     first, spent = load_checkpoint(checkpoint, source, optimizer, objective.key) if resume else (0, 0.0)

@@ -112,12 +112,12 @@ class Pipeline:
         if name == "corrections":
             return stage_key(dict(self.corrections), cfg.seed, {"base": self.key("base")})
         if name == "pointmap":
-            wanted = {"loop": dataclasses.asdict(cfg.pointmap), "map": dataclasses.asdict(cfg.model.point_map)}
+            wanted = {"loop": _loop_values(cfg.pointmap), "map": dataclasses.asdict(cfg.model.point_map)}
             return stage_key(wanted, cfg.seed, {"views": shard_hash(shards("views"))})
         if name == "tokenizer":
             inputs = {kind: shard_hash(shards(kind)) for kind in ("clips", "views", "demos")}
             wanted = {
-                "loop": dataclasses.asdict(cfg.tokenizer), "motion": dataclasses.asdict(cfg.model.motion),
+                "loop": _loop_values(cfg.tokenizer), "motion": dataclasses.asdict(cfg.model.motion),
                 "bias": FEATURE_BIAS.tolist(),
             }  # fmt: skip
             return stage_key(wanted, cfg.seed, inputs)
@@ -315,6 +315,11 @@ class Pipeline:
         if self._collect is None:
             raise ValueError("stage 'selu' needs rollouts: no collector was given")
         return run_selu(self, folder, key, self._collect)
+
+
+def _loop_values(cfg: LoopConfig) -> dict[str, Any]:
+    """A loop's values for a key: AdamW goes without saying, so that output from before there was a choice stays current."""
+    return {name: value for name, value in dataclasses.asdict(cfg).items() if (name, value) != ("optimizer", "adamw")}
 
 
 def _seeded(make: Callable[[], Any], seed: int) -> Any:

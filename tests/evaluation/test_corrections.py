@@ -61,7 +61,7 @@ def in_words(request_: CorrectionRequest, monkeypatch: pytest.MonkeyPatch) -> Co
     def reader(moments: Sequence[Mapping[str, Any]]) -> list[PlanStep | None]:
         return [None if moment["step"] % 3 == 2 else PlanStep.parse(f"Pick(left, {moment['known'][-1]})") for moment in moments]
 
-    monkeypatch.setattr(corrections, "_reader", lambda model: reader)
+    monkeypatch.setattr(corrections, "student_in_words", lambda model: reader)
     return dataclasses.replace(request_, kind="exercises", episodes=6)
 
 
