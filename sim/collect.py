@@ -32,7 +32,7 @@ __all__ = ["collect", "main", "parts_of", "rows_of_part"]
 _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.
-_VERSION = {"views": 2, "demos": 3, "exercises": 2, "judgements": 2}
+_VERSION = {"views": 2, "demos": 3, "exercises": 3, "judgements": 3}
 _IN_WORDS = ("out", "workers", "views_per_world", "image_size", "noise", "medium_share")
 #: Fields that do not change what is written.
 _UNKEYED = {

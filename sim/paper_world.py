@@ -37,16 +37,18 @@ _HEIGHT_STEP_M: Final = 0.05
 _LOWEST_M, _HIGHEST_M = -0.5, 0.2
 #: Shares of steps that are mistakes, one drawn per episode.
 _MISTAKES: Final = (0.1, 0.3, 0.5)
-#: What physics may say to an action that was right, with a probability.
-_BAD_LUCK: Final = 0.04
-_MISHAPS: Final[Mapping[str, FailureCode]] = {
-    "Pick": FailureCode.GRASP_MISSED,
-    "Lift": FailureCode.GRASP_MISSED,
-    "Open": FailureCode.HANDLE_SLIPPED,
-    "Close": FailureCode.HANDLE_SLIPPED,
-    "ToggleOn": FailureCode.NOTHING_HAPPENED,
-    "ToggleOff": FailureCode.NOTHING_HAPPENED,
+#: What physics says to an action that was right, with a probability: once, or every time from the same stance.
+_BAD_LUCK: Final = 0.02
+_AWKWARD: Final = 0.08
+_MISHAPS: Final[Mapping[str, tuple[FailureCode, ...]]] = {
+    "Pick": (FailureCode.GRASP_MISSED, FailureCode.OBSTRUCTED),
+    "Lift": (FailureCode.GRASP_MISSED, FailureCode.OBSTRUCTED),
+    "Open": (FailureCode.HANDLE_SLIPPED, FailureCode.GRASP_MISSED, FailureCode.OBSTRUCTED),
+    "Close": (FailureCode.HANDLE_SLIPPED, FailureCode.GRASP_MISSED, FailureCode.OBSTRUCTED),
+    "Place": (FailureCode.OBSTRUCTED,),
 }
+#: Sides from which to try again.
+_BEARINGS_DEG: Final = (-20.0, 20.0)
 #: Furniture of made-up rooms.
 _SURFACES: Final = ("CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser", "Shelf")
 _CONTAINERS: Final = ("Fridge", "Cabinet", "Drawer", "Microwave")
@@ -292,6 +294,9 @@ class _PaperWorld:
         self.seen: set[str] = set()
         self.visible: list[str] = []
         self._last: Action | None = None
+        #: What does not work from this stance, and how often the robot has come to this place anew.
+        self._awkward: dict[Action, FailureCode] = {}
+        self._approaches = 0
         self._at, self._near, self._left_first = "", set[str](), False
         focus = next(iter(draft.focus.values()))
         self._arrive(focus if focus in scene.furniture else draft.objects[focus], near=False)
@@ -349,6 +354,9 @@ class _PaperWorld:
 
     def _arrive(self, place: str, near: bool = True, wanted: str = "") -> None:
         """Stands in front of a piece of furniture and looks."""
+        if place != self._at:
+            self._approaches = 0
+            self._awkward.clear()
         self._at, self._told = place, False
         self._left_first = bool(self._rng.random() < 0.35)
         ids = self._scene.furniture
@@ -383,16 +391,20 @@ class _PaperWorld:
         if misfit:
             move = Action("MoveUp" if misfit > 0 else "MoveDown", amount=round(abs(misfit), 2))
             return PlanStep((move,)), self._told
-        return self._with_companion(head, jobs[1:]), True
+        arms = [arm for arm in self._arms(head) if head.action(arm) not in self._awkward]
+        if not arms:
+            side = _BEARINGS_DEG[self._approaches % len(_BEARINGS_DEG)]
+            return PlanStep((Action("GoTo", object_id=head.target, bearing_deg=side),)), True
+        return self._with_companion(head, arms[0], jobs[1:]), True
 
-    def _arm(self, job: Job) -> Arm | None:
+    def _arms(self, job: Job) -> list[Arm | None]:
+        """Arms that may do the job, preferred one first."""
         if job.arm is not None or job.verb in ("Lift", "PlaceBoth"):
-            return job.arm
-        free = [arm for arm in _FREE_ARMS if self._held[arm] is None]
-        return free[-1] if self._left_first else free[0]
+            return [job.arm]
+        free: list[Arm | None] = [arm for arm in _FREE_ARMS if self._held[arm] is None]
+        return free[::-1] if self._left_first else free
 
-    def _with_companion(self, head: Job, others: Sequence[Job]) -> PlanStep:
-        arm = self._arm(head)
+    def _with_companion(self, head: Job, arm: Arm | None, others: Sequence[Job]) -> PlanStep:
         first = head.action(arm)
         for job in others:
             known = job.target not in self._parents or job.target in self.seen
@@ -400,7 +412,8 @@ class _PaperWorld:
                 continue
             if job.verb in ("Lift", "PlaceBoth") or job.arm is arm or (job.arm is None and self._held[arm.other] is not None):
                 continue
-            return PlanStep((first, job.action(arm.other)))
+            if job.action(arm.other) not in self._awkward:
+                return PlanStep((first, job.action(arm.other)))
         return PlanStep((first,))
 
     # ---- what actions do
@@ -423,8 +436,15 @@ class _PaperWorld:
         if misfit:
             self._told = True
             return FailureCode.BODY_TOO_LOW if misfit > 0 else FailureCode.BODY_TOO_HIGH
-        if action.name in _MISHAPS and self._rng.random() < _BAD_LUCK:
-            return _MISHAPS[action.name]
+        if action in self._awkward:
+            return self._awkward[action]
+        if self._rng.random() < _BAD_LUCK:
+            return FailureCode.NOTHING_HAPPENED
+        codes = _MISHAPS.get(action.name, ())
+        if codes and self._rng.random() < _AWKWARD:
+            self._awkward[action] = codes[int(self._rng.integers(len(codes)))]
+            return self._awkward[action]
+        self._awkward.clear()
         self._change(action)
         return "ok"
 
@@ -434,6 +454,9 @@ class _PaperWorld:
             place = self._place(target or "")
             if place is None:
                 return FailureCode.ALREADY_HELD
+            if place == self._at and self._awkward and (action.bearing_deg or action.amount):  # the plain stance is the old one
+                self._approaches += 1
+                self._awkward.clear()
             self._arrive(place, wanted=target or "")
         elif action.name in ("MoveUp", "MoveDown"):
             change = (action.amount or 0.0) * (1 if action.name == "MoveUp" else -1)
@@ -441,12 +464,14 @@ class _PaperWorld:
                 return FailureCode.HEIGHT_LIMIT
             self._height_m += change
             self._told = False
+            self._awkward.clear()
         else:
             self._look_around()
         return "ok"
 
     def _look_around(self) -> None:
         """After a turn or a step the stance is another one; what stands here comes into view."""
+        self._awkward.clear()
         things = [name for name, carrier in self._parents.items() if carrier == self._at and not self._hidden(name)]
         self.seen.update(things)
         self.visible += [name for name in things if name not in self.visible]
