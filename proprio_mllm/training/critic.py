@@ -229,13 +229,14 @@ def actor_examples(kept: Sequence[Kept], style: Style, last: int) -> list[Exampl
     """Planning examples of kept trajectories: every step that worked, up to the moment at which the goal held.
 
     `Done()` is never a target: an episode ends by itself when its goals hold, and relabelled goals would teach to stop early.
+    Going where the robot has just gone works, but teaches to stand still.
     """
     examples: list[Example] = []
     for item in kept:
         t, rollout = item.trajectory, item.trajectory.rollout
         for at in range(item.end):
             moment = rollout.moments[at]
-            if not moment.ok or moment.step == "Done()":
+            if not moment.ok or moment.step == "Done()" or _stays(rollout, at):
                 continue
             prompt = plan_prompt(
                 item.goal,
@@ -251,6 +252,12 @@ def actor_examples(kept: Sequence[Kept], style: Style, last: int) -> list[Exampl
             )
             examples.append(Example(with_answer(prompt, moment.step), (rollout.view(at),)))
     return examples
+
+
+def _stays(rollout: Rollout, at: int) -> bool:
+    """Whether a step only repeats the way to where the step before went."""
+    before, now = rollout.moments[at - 1] if at else None, rollout.moments[at]
+    return before is not None and before.ok and before.step == now.step and now.step.startswith("GoTo(")
 
 
 def audit(trajectories: Sequence[Trajectory], goals: Mapping[tuple[str, str], Relabel], judge: Judge) -> dict[str, float]:

@@ -43,7 +43,7 @@ logger = logging.getLogger(__name__)
 Metrics = dict[str, float]
 
 #: Raised when what a stage trains on changes in code, so that older output is not taken for current.
-RECIPES: Final[Mapping[str, int]] = {"base": 2, "alignment": 4}
+RECIPES: Final[Mapping[str, int]] = {"base": 2, "alignment": 4, "selu": 2}
 #: Stages whose current output a stage starts from.
 NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
     "corrections": ("base",),
@@ -127,7 +127,8 @@ class Pipeline:
             wanted = {"alignment": dataclasses.asdict(cfg.alignment), "model": model, "recipe": RECIPES["alignment"]}
             return stage_key(wanted, cfg.seed, inputs)
         if name == "selu":
-            return stage_key({"selu": dataclasses.asdict(cfg.selu)}, cfg.seed, {"alignment": self.key("alignment")})
+            wanted = {"selu": dataclasses.asdict(cfg.selu), "recipe": RECIPES["selu"]}
+            return stage_key(wanted, cfg.seed, {"alignment": self.key("alignment")})
         raise ValueError(f"stage {name!r} has no key; allowed: {', '.join(STAGES)}")
 
     def run(self, name: str) -> Metrics | None:

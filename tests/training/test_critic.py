@@ -91,6 +91,13 @@ def test_duplicates_and_caps() -> None:
     assert len(keep(others, {}, judge, 2)) == 2
 
 
+def test_standing_still_is_not_learnt() -> None:
+    steps = [("GoTo(Mug_1)", False), ("GoTo(Mug_1)", True), ("GoTo(Mug_1)", True), ("MoveUp(0.1)", True), ("MoveUp(0.1)", True)]
+    kept = keep([trajectory("a", steps, "Pick up the mug.", True)], {}, Scripted({("a", 5, "Pick up the mug.")}), 10)
+    targets = [example.messages[-1].text for example in actor_examples(kept, "terse", 4)]
+    assert targets == ["GoTo(Mug_1)", "MoveUp(0.1)", "MoveUp(0.1)"]
+
+
 @pytest.fixture
 def demos(shards: Path, cfg: ModelConfig) -> Demos:
     return Demos(shards / "demos", cfg)
