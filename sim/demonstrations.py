@@ -24,6 +24,7 @@ from data.records import Action, ActionKind, Observation, PlanStep
 from data.shards import encode_png
 from sim.expert import Expert
 from sim.session import Session
+from sim.students import accepted
 from sim.tasks.sample import TRAIN_SEEDS, rng_for, sample_task
 from sim.tasks.task import Task
 
@@ -130,8 +131,8 @@ def run_correction(
         target = expert.next_step()
         step, origin = target, "expert"
         if rng.random() >= config.noise and len(episode.rows) < task.step_budget - _FINISH:
-            proposed = student(observation)
-            if proposed is not None and proposed.actions[0].name != "Done" and not _repeats(proposed, observation):
+            proposed = accepted(student(observation), observation.history[-1] if observation.history else None)
+            if proposed is not None:
                 step, origin = proposed, "student"
         executed = {"executed": step.to_text(), "origin": origin}
         episode.rows.append(_row(observation, task, robot, _STUDENT_FROM + index, target, executed))
@@ -140,15 +141,6 @@ def run_correction(
         observation, _ = session.step(step)
     episode.success, episode.steps = session.succeeded, len(episode.rows)
     return episode
-
-
-def _repeats(step: PlanStep, observation: Observation) -> bool:
-    """Whether a step is the one that has just failed."""
-    if not observation.history:
-        return False
-    last = observation.history[-1]
-    worked = all(outcome.endswith(" ok") for outcome in last.feedback.split("; "))
-    return last.step == step.to_text() and not worked
 
 
 def _start(

@@ -21,8 +21,9 @@ from typing import Any, Final
 import numpy as np
 
 from configs.schema.collect import CollectConfig
-from data.records import Action, ActionKind, Arm, PlanStep
+from data.records import Action, ActionKind, Arm, HistoryItem, PlanStep
 from sim.failures import FailureCode
+from sim.students import accepted
 from sim.tasks.drafts import FAMILIES, Draft, NoDraft, Scene, category_of, draw
 from sim.tasks.jobs import Facts, Job, plan_jobs
 from sim.tasks.sample import rng_for, scene_of, typical_steps
@@ -107,8 +108,7 @@ def corrections_of_part(config: CollectConfig, part: int, student: Student) -> I
 
     def chosen(episode: _Episode, target: PlanStep, proposed: PlanStep | None) -> PlanStep:
         own = episode.rng.random() >= config.noise
-        usable = proposed is not None and proposed.actions[0].name != "Done" and not episode.refused(proposed)
-        return proposed if own and usable and proposed is not None else target
+        return (accepted(proposed, episode.last) if own else None) or target
 
     episodes = [_Episode(config, index, "corrected exercises") for index in config.indices(part)]
     for episode in _side_by_side(episodes, student, chosen):
@@ -156,7 +156,7 @@ class _Episode:
         hidden = [thing for thing in draft.objects if thing not in self.world.seen]
         instruction = draft.sentences(scene.furniture, self.rng, hidden)[0]
         self._budget = int(np.ceil(1.5 * typical_steps(draft.family))) + 2 + int(self.rng.choice((0, 0, 5, 10)))
-        self._last = min(self._budget, _MAX_STEPS)
+        self._steps = min(self._budget, _MAX_STEPS)
         self.mistakes = float(self.rng.choice(_MISTAKES))
         self.exercise = Exercise()
         self._history: list[dict[str, str]] = []
@@ -180,7 +180,7 @@ class _Episode:
                 "history": self._history[-_HISTORY:],
             }
         )
-        answer = self.world.answer() if number < self._last else None
+        answer = self.world.answer() if number < self._steps else None
         if answer is None:
             return None
         target, justified = answer
@@ -188,10 +188,10 @@ class _Episode:
             self.exercise.rows.append({**self.exercise.moments[-1], "target": target.to_text()})
         return target
 
-    def refused(self, step: PlanStep) -> bool:
-        """Whether a step is the one that has just failed."""
-        last = self._history[-1] if self._history else {"step": "", "feedback": " ok"}
-        return last["step"] == step.to_text() and not all(told.endswith(" ok") for told in last["feedback"].split("; "))
+    @property
+    def last(self) -> HistoryItem | None:
+        """The newest entry of the log."""
+        return HistoryItem(**self._history[-1]) if self._history else None
 
     def take(self, step: PlanStep | None) -> None:
         """Carries a step out; None is a reply that names none."""

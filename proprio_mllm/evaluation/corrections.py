@@ -34,8 +34,6 @@ __all__ = ["collect_corrections", "student_in_words"]
 
 #: Episodes of a part; those in words go side by side.
 _PER_PART: Final[dict[str, int]] = {"demos": 10, "exercises": 50}
-#: Tokens of the longest planning step.
-_LONGEST_STEP: Final = 40
 
 
 def collect_corrections(request: CorrectionRequest, robots: Sequence[str] = ("h1", "x1"), workers: int = 2) -> None:
@@ -107,13 +105,13 @@ def student_in_words(model: str) -> Callable[[Sequence[Mapping[str, Any]]], list
     """The model in a folder as a student of `sim.paper_world`: its greedy steps for moments in words, without motion."""
     from proprio_mllm.model.batch import Example
     from proprio_mllm.planners.protocol import parse_reply
-    from proprio_mllm.training.asking import replies
+    from proprio_mllm.training.asking import LONGEST_STEP, replies
     from proprio_mllm.training.sources import step_in_words
 
     reader = _planner(model).model
 
     def steps(moments: Sequence[Mapping[str, Any]]) -> list[PlanStep | None]:
         asked = [Example(step_in_words(moment, None, reader.cfg)) for moment in moments]
-        return [parse_reply(text).step for text in replies(reader, asked, _LONGEST_STEP)]
+        return [parse_reply(text).step for text in replies(reader, asked, LONGEST_STEP)]
 
     return steps

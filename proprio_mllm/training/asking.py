@@ -11,9 +11,11 @@ import torch
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.modeling import ProprioMLLM
 
-__all__ = ["answer_shares", "replies"]
+__all__ = ["LONGEST_STEP", "answer_shares", "replies"]
 
 _BATCH: Final = 16
+#: Tokens of the longest planning step.
+LONGEST_STEP: Final = 40
 #: Longest answer of a word, a number or one action, tokens.
 _SHORT: Final = 10
 

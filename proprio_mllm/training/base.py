@@ -22,7 +22,7 @@ from proprio_mllm.model.batch import Batch, Collator, Example, ImageBatch, Movab
 from proprio_mllm.model.dense import DenseHead, DenseTargets, dense_targets
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
-from proprio_mllm.training.asking import answer_shares, replies
+from proprio_mllm.training.asking import LONGEST_STEP, answer_shares, replies
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, Exercises, Views
@@ -31,8 +31,6 @@ __all__ = ["DenseObjective", "JointObjective", "exercise_accuracy", "grounding_a
 
 #: Share of phrases among the exercises.
 PHRASES: Final = 0.1
-#: Tokens of the longest planning step.
-_LONGEST_STEP: Final = 40
 
 
 class _WithDense(nn.Module):
@@ -197,7 +195,7 @@ def exercise_accuracy(
     """Share of held-out exercises without pictures that the model's greedy reply repeats exactly; `bodies` adds motion."""
     rng = np.random.default_rng(0)
     order = [int(i) for i in exercises.test[:: max(1, len(exercises.test) // limit)][:limit]]
-    said = replies(model, [exercises.example(i, rng, bodies, answered=False) for i in order], _LONGEST_STEP)
+    said = replies(model, [exercises.example(i, rng, bodies, answered=False) for i in order], LONGEST_STEP)
     exact = sum(reply == exercises.target(i) for i, reply in zip(order, said, strict=True))
     return {"exercise_exact": exact / max(len(order), 1), "exercise_steps": float(len(order))}
 
@@ -208,7 +206,7 @@ def plan_accuracy(model: ProprioMLLM, demos: Demos, tokens: Any = None, limit: i
     motion = None if tokens is None else demos.tokens(tokens)
     order = [int(i) for i in demos.split.test[:limit]]
     asked = [demos.example(i, None if motion is None else motion[i].tolist(), answered=False) for i in order]
-    pairs = [(reply, demos.target(i)) for i, reply in zip(order, replies(model, asked, _LONGEST_STEP), strict=True)]
+    pairs = [(reply, demos.target(i)) for i, reply in zip(order, replies(model, asked, LONGEST_STEP), strict=True)]
     exact = sum(reply == target for reply, target in pairs)
     verb = sum(reply.split("(")[0].strip() == target.split("(")[0] for reply, target in pairs)
     return {"plan_exact": exact / max(len(order), 1), "plan_verb": verb / max(len(order), 1), "plan_steps": float(len(order))}
