@@ -1,7 +1,8 @@
 """Conversations as ChatML text and as token ids with a loss mask.
 
-A conversation is a sequence of `Message`s. Only the assistant's texts are supervised, closing token included. Several question
-and answer pairs about one image are consecutive turns of one conversation.
+A conversation is a sequence of `Message`s. The assistant's texts are supervised, closing token included, and those spans of a
+user's text that repeat earlier answers. Several question and answer pairs about one image are consecutive turns of one
+conversation.
 """
 
 from __future__ import annotations
@@ -27,18 +28,23 @@ class Message:
         text: what is said.
         images: number of images that stand before the text.
         supervised: whether an assistant's text is learnt; context turns are not.
+        learnt: spans (start, end) of a user's text that are learnt too, in order. They begin and end where the tokenizer cuts
+            anyway: after a line end, before a space.
     """
 
     role: Role
     text: str
     images: int = 0
     supervised: bool = True
+    learnt: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self) -> None:
         if self.role not in ("system", "user", "assistant"):
             raise ValueError(f"role {self.role!r} is not allowed; allowed: system, user, assistant")
         if self.images and self.role != "user":
             raise ValueError(f"only user messages carry images, got {self.images} in a {self.role} message")
+        if self.learnt and self.role != "user":
+            raise ValueError(f"only user messages name spans to learn, got {self.learnt} in a {self.role} message")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +81,17 @@ def to_chat(messages: Sequence[Message]) -> list[dict[str, object]]:
 def encode(tokenizer: PreTrainedTokenizerBase, messages: Sequence[Message], generation: bool = False) -> Encoded:
     """Token ids and targets of a conversation.
 
-    The pieces are cut at special tokens and line ends, so that encoding them one by one equals encoding the whole text.
+    The pieces are cut at special tokens, line ends and before spaces, so that encoding them one by one equals encoding the
+    whole text.
     """
     pieces: list[tuple[str, bool]] = []
     for m in messages:
         pieces.append((f"{_opening(m.role)}{IMAGE * m.images}", False))
-        supervised = m.role == "assistant" and m.supervised
-        pieces.append((f"{m.text}<|im_end|>", supervised))
+        at = 0
+        for start, end in m.learnt:
+            pieces += [(m.text[at:start], False), (m.text[start:end], True)]
+            at = end
+        pieces.append((f"{m.text[at:]}<|im_end|>", m.role == "assistant" and m.supervised))
         pieces.append(("\n", False))
     if generation:
         pieces.append((_opening("assistant"), False))

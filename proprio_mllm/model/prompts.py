@@ -77,7 +77,19 @@ def _log(history: Sequence[HistoryItem], last: int, style: Style) -> str:
     shown = list(history)[-last:] if last else []
     # The feedback repeats the actions with their results; the step alone stands in where there is none.
     lines = [item.feedback or item.step for item in shown]
-    return ("|" if style == "terse" else "; then ").join(lines) or ("" if style == "terse" else "nothing yet")
+    return "\n".join(lines) or ("" if style == "terse" else "nothing yet")
+
+
+def _learnt(history: Sequence[HistoryItem], last: int, right: Sequence[bool], start: int) -> tuple[tuple[int, int], ...]:
+    """Spans of the right steps in a log that begins at `start`; a log does not write steps of two actions as answers do."""
+    shown = list(zip(history, right, strict=True))[-last:] if last and right else []
+    spans: list[tuple[int, int]] = []
+    for item, learnt in shown:
+        line = item.feedback or item.step
+        if learnt and line.startswith(f"{item.step} "):
+            spans.append((start, start + len(item.step)))
+        start += len(line) + 1
+    return tuple(spans)
 
 
 def plan_prompt(
@@ -91,6 +103,7 @@ def plan_prompt(
     motion: Sequence[int] | None = None,
     style: Style = "terse",
     last: int = 4,
+    right: Sequence[bool] = (),
 ) -> tuple[Message, ...]:
     """The planner's prompt about one image; the reply is `PlanStep` text.
 
@@ -105,20 +118,24 @@ def plan_prompt(
         motion: motion tokens of the last seconds, None leaves proprioception out.
         style: terse or full.
         last: number of earlier steps shown.
+        right: for training, whether each step of `history` is what the answer would have been at its moment, so that it is
+            learnt as the answer is; empty learns the answer alone.
     """
     other = _elsewhere(visible, known)
     if style == "terse":
-        text = (
+        head = (
             f"{_body(motion, style)}{robot} {step + 1}/{step_budget} {instruction}\n"
-            f"see {_ids(visible, style)}\nknow {_ids(other, style)}\ndid {_log(history, last, style)}"
+            f"see {_ids(visible, style)}\nknow {_ids(other, style)}\ndid\n"
         )
+        tail = ""
     else:
-        text = (
+        head = (
             f"{_body(motion, style)}Robot: {robot}. Step {step + 1} of {step_budget}.\nTask: {instruction}\n"
-            f"In view: {_ids(visible, style)}\nKnown elsewhere: {_ids(other, style)}\n"
-            f"Last steps: {_log(history, last, style)}\nNext step?"
+            f"In view: {_ids(visible, style)}\nKnown elsewhere: {_ids(other, style)}\nLast steps:\n"
         )
-    return (_system("plan", style), Message("user", text, images=1))
+        tail = "\nNext step?"
+    text = f"{head}{_log(history, last, style)}{tail}"
+    return (_system("plan", style), Message("user", text, 1, learnt=_learnt(history, last, right, len(head))))
 
 
 def with_answer(prompt: Sequence[Message], answer: str) -> tuple[Message, ...]:
@@ -200,10 +217,10 @@ def critic_prompt(
 ) -> tuple[Message, ...]:
     """Was the goal completed? The reply is `yes` or `no`."""
     if style == "terse":
-        text = f"{_body(motion, style)}see {_ids(visible, style)}\ndid {_log(history, last, style)}\n{goal}?"
+        text = f"{_body(motion, style)}see {_ids(visible, style)}\ndid\n{_log(history, last, style)}\n{goal}?"
     else:
         text = (
-            f"{_body(motion, style)}In view: {_ids(visible, style)}\nLog: {_log(history, last, style)}\n"
+            f"{_body(motion, style)}In view: {_ids(visible, style)}\nLog:\n{_log(history, last, style)}\n"
             f'Was the goal "{goal}" completed? Answer yes or no.'
         )
     return (_system("judge", style), Message("user", text, images=1))
@@ -241,10 +258,10 @@ def self_ask_prompt(
         last: number of earlier steps shown.
     """
     if style == "terse":
-        text = f"{_body(motion, style)}see {_ids(visible, style)}\ndid {_log(history, last, style)}\nwhich {relation}?"
+        text = f"{_body(motion, style)}see {_ids(visible, style)}\ndid\n{_log(history, last, style)}\nwhich {relation}?"
     else:
         text = (
-            f"{_body(motion, style)}In view: {_ids(visible, style)}\nLog: {_log(history, last, style)}\n"
+            f"{_body(motion, style)}In view: {_ids(visible, style)}\nLog:\n{_log(history, last, style)}\n"
             f"Which objects are {relation}? List their ids, or say none."
         )
     return (_system("judge", style), Message("user", text, images=1))

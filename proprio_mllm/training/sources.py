@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import datasets
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -42,6 +44,9 @@ BODY_RELATIVE = ("arm", "shift")
 #: Shares of exercises: the expert's own logs with names exchanged, which objects an instruction names, which objects are in a
 #: state according to the log. The others ask for the next step of an episode in words.
 FROM_LOGS, NAMING, STATES = 0.2, 0.2, 0.1
+_ID = re.compile(r"[A-Za-z]+_\d+")
+#: Earlier steps that tell what to do next, nearly always.
+_ENOUGH_LOG = 4
 #: Share of corrections among the exercises where there are any.
 CORRECTED = 0.5
 
@@ -154,8 +159,10 @@ class Views:
         return "see?", answers([str(thing["id"]) for thing in ordered][:8])
 
 
-def _planning(row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelConfig) -> tuple[Message, ...]:
-    """The planner's prompt of a row."""
+def _planning(
+    row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelConfig, right: Sequence[bool] = ()
+) -> tuple[Message, ...]:
+    """The planner's prompt of a row; `right` as `plan_prompt` takes it."""
     return plan_prompt(
         row["instruction"],
         row["robot"],
@@ -167,17 +174,57 @@ def _planning(row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelCo
         motion,
         cfg.prompt,
         cfg.history,
+        right,
     )
 
 
-def step_in_words(row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelConfig) -> tuple[Message, ...]:
-    """The planner's prompt of a row without its picture."""
-    return _unpictured(_planning(row, motion, cfg))
+def step_in_words(
+    row: Mapping[str, Any], motion: Sequence[int] | None, cfg: ModelConfig, right: Sequence[bool] = ()
+) -> tuple[Message, ...]:
+    """The planner's prompt of a row without its picture; `right` as `plan_prompt` takes it."""
+    return _unpictured(_planning(row, motion, cfg, right))
 
 
 def _unpictured(prompt: Sequence[Message]) -> tuple[Message, ...]:
     """The same prompt without the picture."""
     return tuple(replace(message, images=0) for message in prompt)
+
+
+class _Logs:
+    """Which steps of a row's log are what the expert would have done at their moments, so that they teach as the answer does.
+
+    So a row teaches several steps for the price of one. What teaches nothing: a mistake, a moment without a recorded answer,
+    one at which something had not been seen yet that the episode then used (the prompt would give it away), and one whose own
+    log is cut off here.
+    """
+
+    def __init__(self, readers: Sequence[ShardReader]) -> None:
+        columns = ["instruction", "robot", "step", "visible", "known", "history", "target"]
+        self._rows = datasets.concatenate_datasets([reader.dataset.select_columns(columns) for reader in readers])
+
+    def right(self, index: int) -> tuple[bool, ...]:
+        """For each entry of the row's log; rows of an episode stand together, in order."""
+        row: Mapping[str, Any] = self._rows[int(index)]
+        log = row["history"]
+        known = {*row["visible"], *row["known"]}
+        used = set(_ID.findall(" ".join((*(item["step"] for item in log), row["target"]))))
+        found = [False] * len(log)
+        for before in range(int(index) - 1, max(int(index) - len(log), 0) - 1, -1):
+            moment: Mapping[str, Any] = self._rows[before]
+            back = int(row["step"]) - int(moment["step"])
+            if not 0 < back <= len(log) or not _same_episode(row, moment, back):
+                break
+            fresh = known - {*moment["visible"], *moment["known"]}
+            told = len(log) - back >= min(len(moment["history"]), _ENOUGH_LOG)
+            found[-back] = told and moment["target"] == log[-back]["step"] and not fresh & used
+        return tuple(found)
+
+
+def _same_episode(row: Mapping[str, Any], moment: Mapping[str, Any], back: int) -> bool:
+    """Whether a row is of the same episode, `back` steps earlier."""
+    same = all(row[name] == moment[name] for name in ("instruction", "robot"))
+    earlier = row["history"][:-back]
+    return same and (not earlier or earlier[-1:] == moment["history"][-1:])
 
 
 class _Joined:
@@ -186,6 +233,9 @@ class _Joined:
     def __init__(self, folders: Sequence[Path]) -> None:
         self._readers = [ShardReader(folder, "demos") for folder in folders]
         self._starts = np.cumsum([0, *(len(reader) for reader in self._readers)])
+
+    def logs(self) -> _Logs:
+        return _Logs(self._readers)
 
     def column(self, name: str) -> list[Any]:
         return [value for reader in self._readers for value in reader.column(name)]
@@ -218,7 +268,7 @@ class Demos:
         #: Training rows of each episode's last step, after which the goals held: collectors keep successes only.
         self.finals = np.intersect1d([index for _, index in last.values()], self.split.train)
         self.style: Style = cfg.prompt
-        self._cfg = cfg
+        self._cfg, self._logs = cfg, self.reader.logs()
         labels = np.char.add(np.asarray(self.reader.column("category")), np.asarray(self.reader.folder_of(), dtype=str))
         labels = labels[self.split.train]
         self._groups = [self.split.train[labels == name] for name in sorted(set(labels))]
@@ -240,7 +290,7 @@ class Demos:
     def example(self, index: int, motion: Sequence[int] | None, answered: bool = True) -> Example:
         """The step's conversation; `motion` None leaves proprioception out of the prompt."""
         row = self.reader[int(index)]
-        prompt = _planning(row, motion, self._cfg)
+        prompt = _planning(row, motion, self._cfg, self._logs.right(index) if answered else ())
         return Example(with_answer(prompt, row["target"]) if answered else prompt, (self.view(row),))
 
     def exercise(self, rng: np.random.Generator, bodies: Bodies | None = None) -> Example:
@@ -248,7 +298,8 @@ class Demos:
         index = int(rng.choice(self._symbolic))
         exchanged = Exchange.draw(rng).row(self.reader[index])
         motion = None if bodies is None else bodies.row(index)
-        return Example(with_answer(step_in_words(exchanged, motion, self._cfg), exchanged["target"]))
+        prompt = step_in_words(exchanged, motion, self._cfg, self._logs.right(index))
+        return Example(with_answer(prompt, exchanged["target"]))
 
     def view(self, row: Mapping[str, Any]) -> View:
         """The head-camera view of a row."""
@@ -308,15 +359,17 @@ class Exercises:
     def __init__(self, folder: Path, cfg: ModelConfig, demos: Demos, corrected: Path | None = None) -> None:
         self.reader = ShardReader(folder, "exercises")
         self._corrected = None if corrected is None else ShardReader(corrected, "exercises")
-        self._cfg, self._demos = cfg, demos
+        self._cfg, self._demos, self._logs = cfg, demos, _Logs([self.reader])
+        self._corrected_logs = None if self._corrected is None else _Logs([self._corrected])
         # rows of an episode stand together: the last ones are held out
         self._train = len(self.reader) - len(self.reader) // HELD_OUT
         self.test = np.arange(self._train, len(self.reader), dtype=np.int64)
 
     def draw(self, rng: np.random.Generator, bodies: Bodies | None = None) -> Example:
         """A training example; with `bodies` steps get motion whose hands agree with the log."""
-        if self._corrected is not None and rng.random() < CORRECTED:
-            return self._step(self._corrected[int(rng.integers(len(self._corrected)))], rng, bodies, True)
+        if self._corrected is not None and self._corrected_logs is not None and rng.random() < CORRECTED:
+            index = int(rng.integers(len(self._corrected)))
+            return self._step(self._corrected[index], rng, bodies, self._corrected_logs.right(index))
         kind = rng.random()
         if kind < FROM_LOGS:
             return self._demos.exercise(rng, bodies)
@@ -342,11 +395,14 @@ class Exercises:
 
     def example(self, index: int, rng: np.random.Generator, bodies: Bodies | None = None, answered: bool = True) -> Example:
         """One row's conversation; `rng` draws the motion that `bodies` lends."""
-        return self._step(self.reader[int(index)], rng, bodies, answered)
+        return self._step(self.reader[int(index)], rng, bodies, self._logs.right(index) if answered else None)
 
-    def _step(self, row: Mapping[str, Any], rng: np.random.Generator, bodies: Bodies | None, answered: bool) -> Example:
-        prompt = step_in_words(row, None if bodies is None else bodies.draw(row, rng), self._cfg)
-        return Example(with_answer(prompt, row["target"]) if answered else prompt)
+    def _step(
+        self, row: Mapping[str, Any], rng: np.random.Generator, bodies: Bodies | None, right: Sequence[bool] | None
+    ) -> Example:
+        motion = None if bodies is None else bodies.draw(row, rng)
+        prompt = step_in_words(row, motion, self._cfg, right or ())
+        return Example(prompt if right is None else with_answer(prompt, row["target"]))
 
     def target(self, index: int) -> str:
         """The right step."""

@@ -23,7 +23,7 @@ def test_observation_becomes_prompt_and_view(cfg, build, observation):
     tokenizer.quantizer.codebook.normal_()
     example = plan_example(observation, cfg, tokenizer)
     codes = tokenizer.encode_window(observation.proprioception.motion)
-    assert example.messages[-1].text == f"{motion_text(codes)}h1 2/9 tidy up\nsee Mug_1\nknow Pan_1\ndid GoTo(Mug_1) ok"
+    assert example.messages[-1].text == f"{motion_text(codes)}h1 2/9 tidy up\nsee Mug_1\nknow Pan_1\ndid\nGoTo(Mug_1) ok"
     model, collate = build(cfg)
     batch = collate([example], generation=True)
     assert batch.images.centroids[0] is not None

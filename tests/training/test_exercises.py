@@ -11,6 +11,7 @@ import pytest
 from configs.schema.model import ModelConfig
 from data.motion import HAND_OPENING
 from data.records import HistoryItem
+from data.shards import ShardWriter
 from proprio_mllm.training.exercises import GROUPS, Exchange, is_symbolic
 from proprio_mllm.training.sources import Bodies, Demos, Exercises
 from proprio_mllm.training.states import open_hands
@@ -72,6 +73,46 @@ def test_a_drawn_exchange_is_one_to_one() -> None:
 )
 def test_steps_that_depend_on_the_scene_are_left_out(step: str, symbolic: bool) -> None:
     assert is_symbolic(step) is symbolic
+
+
+def _episode(instruction: str, moments: list[tuple[str, str, list[str]]]) -> list[dict[str, object]]:
+    """Rows of an episode: the expert's step (empty: not recorded), the step taken and what is known, at each moment."""
+    rows: list[dict[str, object]] = []
+    log: list[dict[str, str]] = []
+    for step, (target, taken, known) in enumerate(moments):
+        if target:
+            row = {"instruction": instruction, "robot": "h1", "category": "single", "step": step, "step_budget": 20}
+            rows.append({**row, "visible": [], "known": known, "history": log[-8:], "named": [], "target": target})
+        log.append({"step": taken, "feedback": f"{taken} ok"})
+    return rows
+
+
+def _learnt(exercises: Exercises, index: int) -> list[str]:
+    asked = exercises.example(index, np.random.default_rng(0)).messages[-2]
+    return [asked.text[start:end] for start, end in asked.learnt]
+
+
+def test_steps_of_the_log_that_the_expert_would_have_taken_are_learnt(shards: Path, cfg: ModelConfig, tmp_path: Path) -> None:
+    go, pick, place, drawer = "GoTo(Mug_1)", "Pick(left, Mug_1)", "Place(left, Desk_1)", "Open(left, Drawer_1)"
+    both = ["Mug_1", "Desk_1"]
+    first = _episode("a", [(go, go, both), (pick, place, both), (pick, pick, both), (place, place, [*both, "Cup_1"])])
+    hidden = _episode("b", [(drawer, drawer, ["Drawer_1"]), (go, go, ["Drawer_1", "Mug_1"]), (pick, pick, both)])
+    unsure = _episode("b", [("", go, both), (pick, pick, both), (place, place, both)])
+    ups = [f"MoveUp({n}.5)" for n in range(1, 13)]
+    long = _episode("c", [(up, up, both) for up in ups])
+    writer = ShardWriter(tmp_path / "exercises", "exercises", "test")
+    writer.write(0, [*first, *hidden, *unsure, *long])
+    writer.finish({})
+    exercises = Exercises(tmp_path / "exercises", cfg, Demos(shards / "demos", cfg))
+    # the mistake teaches nothing; the cup, seen last, gives nothing away
+    assert [_learnt(exercises, i) for i in range(4)] == [[], [go], [go], [go, pick]]
+    # the mug in the prompt would give away what the drawer held
+    assert [_learnt(exercises, i) for i in range(4, 7)] == [[], [], [go]]
+    # an episode of the same task follows; its first step has no answer
+    assert [_learnt(exercises, i) for i in range(7, 9)] == [[], [pick]]
+    # of a log that is cut off, the steps that have four others before them
+    assert _learnt(exercises, 9 + 11) == ups[7:11]
+    assert exercises.example(9 + 11, np.random.default_rng(0), answered=False).messages[-1].learnt == ()
 
 
 def test_exercises_in_words_ask_for_steps_names_and_states(shards: Path, cfg: ModelConfig) -> None:
