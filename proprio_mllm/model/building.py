@@ -5,8 +5,9 @@ model is a folder, safetensors and JSON only:
 
     config.json            the ModelConfig, format version, adapter names
     processor/             tokenizer, image processor, chat template
-    vlm/                   backbone weights (only when it was built from scratch)
-    heads.safetensors      cse, mpe, point map, and the merger of a released backbone
+    vlm/                   backbone weights (only when it was built from scratch), or, after `share_backbone`, those of another
+                           stored model, which config.json names with their hash
+    heads.safetensors      cse, mpe, point map, and the merger (what else training moved) of a backbone that is stored elsewhere
     adapters/<name>/       LoRA and motion rows, peft's format
     motion/                the motion tokenizer, when one was given
 """
@@ -14,6 +15,7 @@ model is a folder, safetensors and JSON only:
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 import shutil
@@ -48,10 +50,12 @@ __all__ = [
     "load_motion",
     "merge_adapter",
     "save_model",
+    "share_backbone",
     "use_adapter",
 ]
 
 _FORMAT = 1
+_WEIGHTS, _HEADS = "model.safetensors", "heads.safetensors"
 LORA_TARGETS = r".*language_model\.layers\..*(q|k|v|o|gate|up|down)_proj"
 
 
@@ -225,11 +229,11 @@ def save_model(model: ProprioMLLM, folder: str | Path, motion: MotionTokenizer |
         (work / "vlm").mkdir()
         if model.core.config.tie_word_embeddings:
             state.pop("lm_head.weight", None)
-        save_file({k: v.contiguous() for k, v in state.items()}, work / "vlm" / "model.safetensors", {"format": "pt"})
+        save_file({k: v.contiguous() for k, v in state.items()}, work / "vlm" / _WEIGHTS, {"format": "pt"})
         model.core.config.save_pretrained(str(work / "vlm"))
     else:
         heads |= {f"backbone.{k}": v for k, v in state.items() if ".visual.merger." in k}
-    save_file({k: v.clone().contiguous() for k, v in heads.items()}, work / "heads.safetensors")
+    save_file({k: v.clone().contiguous() for k, v in heads.items()}, work / _HEADS)
     adapters: list[str] = []
     if isinstance(model.vlm, PeftModel):
         adapters = list(model.vlm.peft_config)
@@ -258,7 +262,7 @@ def load_model(folder: str | Path, adapter: str | None = None, trainable: bool =
         trainable: whether adapters keep their gradients.
 
     Raises:
-        ValueError: on an unknown format or adapter.
+        ValueError: on an unknown format or adapter, or when a shared backbone is missing or another one.
     """
     folder = Path(folder)
     stored = json.loads((folder / "config.json").read_text(encoding="utf-8"))
@@ -266,10 +270,10 @@ def load_model(folder: str | Path, adapter: str | None = None, trainable: bool =
         raise ValueError(f"{folder}: model format {stored.get('format')!r}; this version reads {_FORMAT}")
     cfg = build(ModelConfig, stored["config"], "model")
     processor = load_processor(folder / "processor", cfg.image_size)
-    local = dataclasses.replace(cfg, weights=str(folder / "vlm")) if cfg.weights is None else cfg
+    local = dataclasses.replace(cfg, weights=str(_backbone(folder, stored))) if cfg.weights is None else cfg
     model = build_model(local, processor)
     model.cfg = cfg
-    heads = load_file(folder / "heads.safetensors")
+    heads = load_file(folder / _HEADS)
     merger = {k.removeprefix("backbone."): v for k, v in heads.items() if k.startswith("backbone.")}
     model.core.load_state_dict(merger, strict=False)
     own = {k: v for k, v in heads.items() if not k.startswith("backbone.")}
@@ -288,6 +292,45 @@ def load_model(folder: str | Path, adapter: str | None = None, trainable: bool =
         if not trainable:
             model.vlm.requires_grad_(False)
     return model.eval()
+
+
+def share_backbone(folder: str | Path, owner: str | Path) -> None:
+    """Lets a stored model read its backbone from another stored model's; the tensors that differ stay with its heads.
+
+    Args:
+        folder: the stored model; its `vlm` folder is removed.
+        owner: the stored model whose backbone has the same architecture; must stay where it is, seen from `folder`.
+
+    Raises:
+        ValueError: when the backbones have different tensors.
+    """
+    folder, owner = Path(folder), Path(owner)
+    ours, theirs = (load_file(path / "vlm" / _WEIGHTS) for path in (folder, owner))
+    if {k: v.shape for k, v in ours.items()} != {k: v.shape for k, v in theirs.items()}:
+        raise ValueError(f"{folder} and {owner} have backbones of different architectures")
+    moved = {f"backbone.{k}": v for k, v in ours.items() if not torch.equal(v, theirs[k])}
+    save_file({**load_file(folder / _HEADS), **moved}, folder / _HEADS)
+    stored = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    path = owner / "vlm"
+    stored["backbone"] = {"folder": os.path.relpath(path, folder), "sha256": _sha256(path / _WEIGHTS)}
+    (folder / "config.json").write_text(json.dumps(stored, indent=2) + "\n", encoding="utf-8")
+    shutil.rmtree(folder / "vlm")
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _backbone(folder: Path, stored: dict[str, Any]) -> Path:
+    """Where a stored model's backbone is."""
+    if "backbone" not in stored:
+        return folder / "vlm"
+    path = folder / stored["backbone"]["folder"]
+    if not (path / _WEIGHTS).is_file():
+        raise ValueError(f"{folder} shares the backbone of {path}, which is not there: keep the two folders side by side")
+    if _sha256(path / _WEIGHTS) != stored["backbone"]["sha256"]:
+        raise ValueError(f"{path}/{_WEIGHTS} is not the backbone that {folder} was trained on: export both again")
+    return path
 
 
 def load_motion(folder: str | Path) -> MotionTokenizer | None:

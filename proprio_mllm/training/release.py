@@ -4,7 +4,8 @@
         provenance.json         seed, keys and hashes of data and configuration, versions, and for every stage that went into
                                 the model its command and its metrics
 
-Weights are stored as float16, half the size; they are read back as float32. The motion tokenizer keeps its precision, so that
+Weights are stored as float16, half the size; they are read back as float32. A variant's backbone is the base model's, which is
+released beside it, so that its own folder holds only what training moved. The motion tokenizer keeps its precision, so that
 it gives the same tokens as in training, and the critic of stage 3 is left out: a planner does not need it. Git is not asked:
 hashes of data and configuration say what made the weights.
 """
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from safetensors.torch import load_file, save_file
 
+from proprio_mllm.model.building import share_backbone
 from proprio_mllm.training.paths import finished_key
 from proprio_mllm.training.selu import CRITIC
 from proprio_mllm.training.sources import shard_hash
@@ -73,6 +75,8 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
         shutil.rmtree(work, ignore_errors=True)
         shutil.copytree(source, work)
         _shrink(work)
+        if stage != "base" and (work / "vlm").is_dir():
+            share_backbone(work, target.with_name(release_name("base", "")))
         (work / "provenance.json").write_text(json.dumps(_provenance(pipeline, stage, key), indent=1) + "\n", encoding="utf-8")
         size = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) / 1e6
         if size > LARGEST_MB:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from configs.compose import compose
 from configs.schema.model import ModelConfig
@@ -275,6 +276,16 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         if CRITIC not in name:
             torch.testing.assert_close(theirs[name], tensor, atol=1e-4, rtol=1e-3)
     assert not (tmp_path / "tiny" / "full" / "adapters" / CRITIC).exists()
+    assert not (tmp_path / "tiny" / "full" / "vlm").exists()
+    shutil.copytree(tmp_path / "tiny" / "full", tmp_path / "alone" / "full")
+    with pytest.raises(ValueError, match="keep the two folders side by side"):
+        load_model(tmp_path / "alone" / "full")
+    shutil.copytree(tmp_path / "tiny" / "base", tmp_path / "alone" / "base")
+    load_model(tmp_path / "alone" / "full")
+    other = tmp_path / "alone" / "base" / "vlm" / "model.safetensors"
+    save_file({name: tensor + 1 for name, tensor in load_file(other).items()}, other, {"format": "pt"})
+    with pytest.raises(ValueError, match="is not the backbone that"):
+        load_model(tmp_path / "alone" / "full")
     assert release.find_model("nowhere", tmp_path, "tiny", "full", "selu") == tmp_path / "tiny" / "full"
     assert release.find_model(trained.cfg.output, tmp_path, "tiny", "full", "selu") == trained.paths.model("selu")
     with pytest.raises(FileNotFoundError, match="no selu model of tiny \\(no_cse\\)"):
