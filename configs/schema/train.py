@@ -140,7 +140,8 @@ class SeluConfig:
         critic: loop of the critic's fine-tuning.
         actor: loop of the actor's fine-tuning.
         truth: `audit` only reports the critic against the simulator; `oracle` lets the simulator judge (a labelled ablation).
-        replay_share: share of the actor's batches that are planning demonstrations, against forgetting.
+        replay_share: share of the batches that is replayed against forgetting: for the actor demonstrations and exercises,
+            for the critic questions about the expert's logs.
         per_class: most kept trajectories per verb, robot and category.
     """
 

@@ -4,8 +4,8 @@ Actor and critic are two LoRA adapters over the stage-2 model: the actor goes on
 its copy. A round: roll the actor out with a temperature, judge every end, ask oneself and relabel failures keeping the verb,
 fine-tune the critic, judge again, fine-tune the actor on the kept trajectories. Before the first round the critic practises on
 questions about the expert's logs and about episodes in words. The critic's agreement with the simulator is reported and, unless
-`truth=oracle`, never used. Part of each batch is replayed demonstrations against forgetting; the abstract of SELU mentions no
-replay.
+`truth=oracle`, never used. Part of each batch is replayed against forgetting: demonstrations, and exercises in words in the
+proportion of stage 2; the abstract of SELU mentions no replay.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from proprio_mllm.training.goals import Relabel
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
-from proprio_mllm.training.sources import Judgements
+from proprio_mllm.training.sources import Bodies, Judgements
 
 if TYPE_CHECKING:
     from proprio_mllm.training.pipeline import Pipeline
@@ -151,7 +151,9 @@ class _Selu:
         self.collator = Collator(self.model.processor, self.model.cfg)
         self.demos = self.pipeline.demos(self.model.cfg)
         self.judgements = Judgements(self.pipeline.paths.shards("judgements"), self.model.cfg)
+        self.exercises = self.pipeline.exercises(self.model.cfg, self.demos)
         self._tokens = None if self.tokenizer is None else self.demos.tokens(self.tokenizer)
+        self._bodies = None if self._tokens is None else Bodies(self.demos, self._tokens)
 
     def _codes(self, index: int) -> list[int] | None:
         return None if self._tokens is None else self._tokens[index].tolist()
@@ -163,6 +165,8 @@ class _Selu:
         return judge_example(self.demos, index, rng, self._tokens)
 
     def _planning(self, rng: np.random.Generator) -> Example:
+        if rng.random() < self.pipeline.cfg.alignment.exercise_share:
+            return self.exercises.draw(rng, self._bodies)
         index = int(self.demos.draw(rng, 1)[0])
         return self.demos.example(index, self._codes(index))
 
