@@ -358,18 +358,19 @@ class Exercises:
 
     def __init__(self, folder: Path, cfg: ModelConfig, demos: Demos, corrected: Path | None = None) -> None:
         self.reader = ShardReader(folder, "exercises")
-        self._corrected = None if corrected is None else ShardReader(corrected, "exercises")
         self._cfg, self._demos, self._logs = cfg, demos, _Logs([self.reader])
-        self._corrected_logs = None if self._corrected is None else _Logs([self._corrected])
+        corrections = None if corrected is None else ShardReader(corrected, "exercises")
+        self._corrected = None if corrections is None else (corrections, _Logs([corrections]))
         # rows of an episode stand together: the last ones are held out
         self._train = len(self.reader) - len(self.reader) // HELD_OUT
         self.test = np.arange(self._train, len(self.reader), dtype=np.int64)
 
     def draw(self, rng: np.random.Generator, bodies: Bodies | None = None) -> Example:
         """A training example; with `bodies` steps get motion whose hands agree with the log."""
-        if self._corrected is not None and self._corrected_logs is not None and rng.random() < CORRECTED:
-            index = int(rng.integers(len(self._corrected)))
-            return self._step(self._corrected[index], rng, bodies, self._corrected_logs.right(index))
+        if self._corrected is not None and rng.random() < CORRECTED:
+            reader, logs = self._corrected
+            index = int(rng.integers(len(reader)))
+            return self._step(reader[index], rng, bodies, logs.right(index))
         kind = rng.random()
         if kind < FROM_LOGS:
             return self._demos.exercise(rng, bodies)
