@@ -10,7 +10,6 @@ household movements.
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.activities import ACTIVITIES, RECIPES
+from data.files import write_text
 from data.motion import FPS
 from data.representation import joints_from_vectors, vectors_from_joints
 from data.script import Script
@@ -133,8 +133,6 @@ def write_dataset(folder: Path, clips: int, seed: int) -> Path:
         splits["all"].append(clip.name)
     for split, names in splits.items():
         (folder / f"{split}.txt").write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
-    temporary = folder / ".generated.json.tmp"
-    temporary.write_text(json.dumps(recipe), encoding="utf-8")
-    os.replace(temporary, note)
+    write_text(note, json.dumps(recipe))
     (folder / ".writing").unlink()
     return folder

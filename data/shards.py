@@ -27,6 +27,7 @@ from datasets.arrow_writer import ArrowWriter
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from data.files import file_hash, write_text
 from data.motion import N_FEATURES
 from data.shard_kinds import KINDS
 
@@ -162,9 +163,7 @@ class Manifest:
             },
             "metadata": dict(self.metadata),
         }
-        temporary = folder / f".{_MANIFEST}.tmp"
-        temporary.write_text(json.dumps(raw, indent=1), encoding="utf-8")
-        os.replace(temporary, folder / _MANIFEST)
+        write_text(folder / _MANIFEST, json.dumps(raw, indent=1))
 
 
 class ShardWriter:
@@ -200,7 +199,7 @@ class ShardWriter:
                     raise
                 found = None
             if found is not None and (found.kind, found.config_hash) == (kind, config_hash):
-                kept = {i: part for i, part in found.parts.items() if _sha256(self.folder / part.file) == part.sha256}
+                kept = {i: part for i, part in found.parts.items() if _intact(self.folder, part)}
                 self.manifest = Manifest(kind, config_hash, found.complete and kept == found.parts, kept, found.metadata)
             elif not overwrite:
                 assert found is not None
@@ -246,7 +245,7 @@ class ShardWriter:
             writer.close()
             temporary.unlink(missing_ok=True)
             raise
-        digest = _sha256(temporary)
+        digest = file_hash(temporary)
         os.replace(temporary, final)
         parts = {**self.manifest.parts, index: Part(final.name, count, digest)}
         self.manifest = Manifest(self.manifest.kind, self.manifest.config_hash, False, parts, self.manifest.metadata)
@@ -292,7 +291,7 @@ class ShardReader(Sequence[Mapping[str, Any]]):
             path = self.folder / part.file
             if Path(part.file).name != part.file or not path.is_file():
                 raise ShardError(f"{path}: listed in the manifest but missing")
-            if verify and _sha256(path) != part.sha256:
+            if verify and not _intact(path.parent, part):
                 raise ShardError(
                     f"{path}: differs from its checksum; the file is corrupted, delete it and run its producer again"
                 )
@@ -333,11 +332,6 @@ def _plain(value: Any, feature: Any) -> Any:
     return value
 
 
-def _sha256(path: Path) -> str:
-    if not path.is_file():
-        return ""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(1 << 20):
-            digest.update(chunk)
-    return digest.hexdigest()
+def _intact(folder: Path, part: Part) -> bool:
+    path = folder / part.file
+    return path.is_file() and file_hash(path) == part.sha256

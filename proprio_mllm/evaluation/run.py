@@ -14,7 +14,6 @@ import functools
 import hashlib
 import json
 import logging
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from tqdm import tqdm
 
 import configs
 from configs.schema.eval import EvalConfig, PlannerConfig
+from data.files import file_hash, write_text
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
 from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledger, scored
@@ -70,7 +70,7 @@ def weights_digest(folder: Path) -> str:
     digest = hashlib.sha256()
     for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix in (".safetensors", ".json", ".jinja", ".txt")):
         digest.update(path.relative_to(folder).as_posix().encode())
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
+        digest.update(bytes.fromhex(file_hash(path)))
     return digest.hexdigest()[:16]
 
 
@@ -203,9 +203,7 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
     folder = run_folder(cfg, digest)
     folder.mkdir(parents=True, exist_ok=True)
     metadata = _metadata(cfg, jobs, digest, cfg.planner.kind == "expert")
-    temporary = folder / ".run.json.tmp"
-    temporary.write_text(json.dumps(metadata, indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, folder / "run.json")
+    write_text(folder / "run.json", json.dumps(metadata, indent=1) + "\n")
     path = folder / "ledger.jsonl"
     with Ledger(path) as ledger:
         done = set(scored(read_ledger(path)))

@@ -15,7 +15,6 @@ model is a folder, safetensors and JSON only:
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import os
 import shutil
@@ -32,6 +31,7 @@ from transformers import Qwen2_5_VLForConditionalGeneration
 
 from configs.schema.model import ModelConfig
 from configs.validate import build
+from data.files import file_hash, new_folder
 from proprio_mllm.model.backbone import backbone_config
 from proprio_mllm.model.groups import adapter_of
 from proprio_mllm.model.modeling import ProprioMLLM
@@ -219,38 +219,34 @@ def save_model(model: ProprioMLLM, folder: str | Path, motion: MotionTokenizer |
         motion: the motion tokenizer the prompts were made with.
     """
     folder = Path(folder)
-    work = folder.with_name(folder.name + ".tmp")
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
-    model.processor.save_pretrained(str(work / "processor"))
-    state = backbone_state(model)
-    heads = {k: v for k, v in model.state_dict().items() if k.startswith(_head_prefixes(model.cfg))}
-    if model.cfg.weights is None:
-        (work / "vlm").mkdir()
-        if model.core.config.tie_word_embeddings:
-            state.pop("lm_head.weight", None)
-        save_file({k: v.contiguous() for k, v in state.items()}, work / "vlm" / _WEIGHTS, {"format": "pt"})
-        model.core.config.save_pretrained(str(work / "vlm"))
-    else:
-        heads |= {f"backbone.{k}": v for k, v in state.items() if ".visual.merger." in k}
-    save_file({k: v.clone().contiguous() for k, v in heads.items()}, work / _HEADS)
-    adapters: list[str] = []
-    if isinstance(model.vlm, PeftModel):
-        adapters = list(model.vlm.peft_config)
-        for name in adapters:
-            model.vlm.save_pretrained(str(work / "adapters"), selected_adapters=[name], save_embedding_layers=False)
-            if name == "default":  # peft writes this one beside the others
-                (work / "adapters" / name).mkdir(exist_ok=True)
-                for file in ("adapter_config.json", "adapter_model.safetensors"):
-                    os.replace(work / "adapters" / file, work / "adapters" / name / file)
-        for stray in (work / "adapters").rglob("README.md"):
-            stray.unlink()
-    if motion is not None:
-        motion.save(work / "motion")
-    stored = {"format": _FORMAT, "config": dataclasses.asdict(model.cfg), "adapters": adapters}
-    (work / "config.json").write_text(json.dumps(stored, indent=2) + "\n", encoding="utf-8")
-    shutil.rmtree(folder, ignore_errors=True)
-    os.replace(work, folder)
+    with new_folder(folder) as work:
+        model.processor.save_pretrained(str(work / "processor"))
+        state = backbone_state(model)
+        heads = {k: v for k, v in model.state_dict().items() if k.startswith(_head_prefixes(model.cfg))}
+        if model.cfg.weights is None:
+            (work / "vlm").mkdir()
+            if model.core.config.tie_word_embeddings:
+                state.pop("lm_head.weight", None)
+            save_file({k: v.contiguous() for k, v in state.items()}, work / "vlm" / _WEIGHTS, {"format": "pt"})
+            model.core.config.save_pretrained(str(work / "vlm"))
+        else:
+            heads |= {f"backbone.{k}": v for k, v in state.items() if ".visual.merger." in k}
+        save_file({k: v.clone().contiguous() for k, v in heads.items()}, work / _HEADS)
+        adapters: list[str] = []
+        if isinstance(model.vlm, PeftModel):
+            adapters = list(model.vlm.peft_config)
+            for name in adapters:
+                model.vlm.save_pretrained(str(work / "adapters"), selected_adapters=[name], save_embedding_layers=False)
+                if name == "default":  # peft writes this one beside the others
+                    (work / "adapters" / name).mkdir(exist_ok=True)
+                    for file in ("adapter_config.json", "adapter_model.safetensors"):
+                        os.replace(work / "adapters" / file, work / "adapters" / name / file)
+            for stray in (work / "adapters").rglob("README.md"):
+                stray.unlink()
+        if motion is not None:
+            motion.save(work / "motion")
+        stored = {"format": _FORMAT, "config": dataclasses.asdict(model.cfg), "adapters": adapters}
+        (work / "config.json").write_text(json.dumps(stored, indent=2) + "\n", encoding="utf-8")
 
 
 def load_model(folder: str | Path, adapter: str | None = None, trainable: bool = False) -> ProprioMLLM:
@@ -312,13 +308,9 @@ def share_backbone(folder: str | Path, owner: str | Path) -> None:
     save_file({**load_file(folder / _HEADS), **moved}, folder / _HEADS)
     stored = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     path = owner / "vlm"
-    stored["backbone"] = {"folder": os.path.relpath(path, folder), "sha256": _sha256(path / _WEIGHTS)}
+    stored["backbone"] = {"folder": os.path.relpath(path, folder), "sha256": file_hash(path / _WEIGHTS)}
     (folder / "config.json").write_text(json.dumps(stored, indent=2) + "\n", encoding="utf-8")
     shutil.rmtree(folder / "vlm")
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _backbone(folder: Path, stored: dict[str, Any]) -> Path:
@@ -328,7 +320,7 @@ def _backbone(folder: Path, stored: dict[str, Any]) -> Path:
     path = folder / stored["backbone"]["folder"]
     if not (path / _WEIGHTS).is_file():
         raise ValueError(f"{folder} shares the backbone of {path}, which is not there: keep the two folders side by side")
-    if _sha256(path / _WEIGHTS) != stored["backbone"]["sha256"]:
+    if file_hash(path / _WEIGHTS) != stored["backbone"]["sha256"]:
         raise ValueError(f"{path}/{_WEIGHTS} is not the backbone that {folder} was trained on: export both again")
     return path
 

@@ -15,7 +15,6 @@ columns of the resized image, h and w of its patches.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import importlib
 import math
 import pickle
@@ -30,6 +29,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from configs.schema.model import PointMapConfig
+from data.files import file_hash
 from proprio_mllm.model.point_map import GeoFeatures
 
 __all__ = ["CUT3R_512", "Cut3rPointMap", "FloatRope2d", "read_checkpoint"]
@@ -89,14 +89,6 @@ class FloatRope2d(nn.Module):
         return torch.cat(parts, dim=-1)
 
 
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        for block in iter(lambda: stream.read(1 << 20), b""):
-            digest.update(block)
-    return digest.hexdigest()
-
-
 def read_checkpoint(path: str | Path, sha256: str | None, trust: bool = False) -> dict[str, Tensor]:
     """Weights of a CUT3R checkpoint.
 
@@ -109,7 +101,7 @@ def read_checkpoint(path: str | Path, sha256: str | None, trust: bool = False) -
         ValueError: on a missing or wrong checksum, an untrusted pickle, or a file without weights.
     """
     path = Path(path)
-    if sha256 is not None and (found := _sha256(path)) != sha256.lower():
+    if sha256 is not None and (found := file_hash(path)) != sha256.lower():
         raise ValueError(f"{path}: sha256 is {found}, expected {sha256}")
     if path.suffix == ".safetensors":
         return load_file(path)

@@ -28,6 +28,7 @@ from torch.nn import functional
 
 from configs.schema.model import MotionTokenizerConfig
 from configs.validate import build
+from data.files import write_text
 from proprio_mllm.model.quantizer import VectorQuantizer
 
 __all__ = ["MotionTokenizer", "TokenizerLoss"]
@@ -178,10 +179,9 @@ class MotionTokenizer(nn.Module):
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps({"format": _FORMAT, "config": dataclasses.asdict(self.cfg)}, indent=2)
-        (folder / "config.json.tmp").write_text(text + "\n", encoding="utf-8")
         save_file({k: v.contiguous() for k, v in self.state_dict().items()}, folder / "model.safetensors.tmp")
         os.replace(folder / "model.safetensors.tmp", folder / "model.safetensors")
-        os.replace(folder / "config.json.tmp", folder / "config.json")
+        write_text(folder / "config.json", text + "\n")
 
     @staticmethod
     def load(folder: str | Path) -> MotionTokenizer:

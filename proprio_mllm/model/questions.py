@@ -40,12 +40,13 @@ QUESTIONS: Mapping[str, Mapping[Style, str]] = {
     "distance": {"terse": "distance {}", "full": "Is {} near, middle or far?"},
     "height": {"terse": "height {}", "full": "Is {} low, level or high relative to your pelvis?"},
     "arm": {"terse": "Pick {}", "full": "Which arm reaches {} better: left, right or either?"},
+    "see": {"terse": "see?", "full": "Which objects do you see, from left to right? Give their ids."},
     "shift": {"terse": "MoveDown {}", "full": "How must your body height change to reach {}? Give MoveDown, MoveUp or none."},
 }
 
 
-def ask(kind: str, name: str, style: Style = "terse") -> str:
-    """The question of a kind about a named object (id or type).
+def ask(kind: str, name: str = "", style: Style = "terse") -> str:
+    """The question of a kind about a named object (id or type); `see` is about none.
 
     Raises:
         ValueError: on an unknown kind.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from data.files import write_text
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.ledger import read_ledger
 from proprio_mllm.report.summary import CATEGORIES, SUMMARY_VERSION, Row, rows_of, write_json
@@ -117,15 +118,9 @@ def write_report(run: Run) -> Table:
         "rows": [row.to_json() for row in rows],
     }
     write_json(run.folder / "summary.json", summary)
-    _write(run.folder / "table.md", table.to_markdown())
-    _write(run.folder / "table.csv", table.to_csv())
+    write_text(run.folder / "table.md", table.to_markdown())
+    write_text(run.folder / "table.csv", table.to_csv())
     return table
-
-
-def _write(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
 
 
 def newest(runs: Sequence[Run], planner: str, robot: str, difficulty: str, category: str = "all") -> Run | None:

@@ -24,7 +24,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -33,6 +32,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from data.files import write_text
 from data.records import EpisodeRecord, FailureCategory, Outcome
 from proprio_mllm.report.statistics import rate_interval
 
@@ -134,6 +134,4 @@ def rows_of(records: Iterable[EpisodeRecord], categories: Sequence[str] = CATEGO
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Writes JSON atomically."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(json.dumps(values, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(path, json.dumps(values, indent=2, ensure_ascii=False, allow_nan=False) + "\n")

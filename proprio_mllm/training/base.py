@@ -94,7 +94,7 @@ class _Base:
         for row in rows:
             # the list comes last: its order, from left to right, would give away where things are
             pairs = [*self._views.pairs(row, (*GROUNDING, *BODY_RELATIVE), questions, rng), self._views.listing(row)]
-            examples.append(Example(looking(pairs), (row.view,)))
+            examples.append(Example(looking(pairs, style=self._views.style), (row.view,)))
         return _JointBatch("look", self._collator(examples), None, targets, self._cfg.dense_weight)
 
 
@@ -180,7 +180,7 @@ def grounding_accuracy(
         for row in rows:
             for question, answer in views.pairs(row, (kind,), 1, rng):
                 motion = None if tokens is None else tokens.encode_window(row.motion)
-                asked.append(Example(looking([(question, "")], motion), (row.view,)))
+                asked.append(Example(looking([(question, "")], motion, views.style), (row.view,)))
                 answers.append(answer)
         if asked:
             result |= answer_shares(model, kind, asked, answers)

@@ -6,14 +6,14 @@ Batches depend on (seed, step) alone, so weights, optimiser state and the step n
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
+
+from data.files import new_folder
 
 __all__ = ["load_checkpoint", "save_checkpoint"]
 
@@ -31,21 +31,13 @@ def save_checkpoint(
         key: identifies the run; a checkpoint of another key is not loaded.
         seconds: time spent so far.
     """
-    work = folder.with_name(folder.name + ".tmp")
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
-    save_file(_trained(module), work / "model.safetensors")
-    state = optimizer.state_dict()["state"]
-    entries = [(f"{index}.{name}", value) for index, entry in state.items() for name, value in entry.items()]
-    flat = {name: torch.as_tensor(value).contiguous() for name, value in entries}
-    save_file(flat, work / "optimizer.safetensors")
-    (work / "state.json").write_text(json.dumps({"step": step, "key": key, "seconds": seconds}), encoding="utf-8")
-    old = folder.with_name(folder.name + ".old")
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        os.replace(folder, old)
-    os.replace(work, folder)
-    shutil.rmtree(old, ignore_errors=True)
+    with new_folder(folder) as work:
+        save_file(_trained(module), work / "model.safetensors")
+        state = optimizer.state_dict()["state"]
+        entries = [(f"{index}.{name}", value) for index, entry in state.items() for name, value in entry.items()]
+        flat = {name: torch.as_tensor(value).contiguous() for name, value in entries}
+        save_file(flat, work / "optimizer.safetensors")
+        (work / "state.json").write_text(json.dumps({"step": step, "key": key, "seconds": seconds}), encoding="utf-8")
 
 
 def load_checkpoint(folder: Path, module: nn.Module, optimizer: torch.optim.Optimizer, key: str) -> tuple[int, float]:

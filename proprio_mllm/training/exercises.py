@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-__all__ = ["GROUPS", "Exchange", "is_symbolic"]
+__all__ = ["GROUPS", "OBJECT_ID", "Exchange", "is_symbolic"]
 
 #: Object types that tasks use alike, with the words that instructions use for them.
 GROUPS: Final[tuple[Mapping[str, str], ...]] = (
@@ -37,7 +37,8 @@ GROUPS: Final[tuple[Mapping[str, str], ...]] = (
         "Television": "TV",
     },
 )  # fmt: skip
-_ID: Final = re.compile(r"([A-Z][A-Za-z]*)_(\d+)")
+#: An object id: its type and number.
+OBJECT_ID: Final = re.compile(r"([A-Z][A-Za-z]*)_(\d+)")
 #: Longer names first: a soap bottle is no bottle.
 _WORDS: Final = sorted((word for group in GROUPS for word in group.values()), key=len, reverse=True)
 _WORD: Final = re.compile(r"\b(" + "|".join(_WORDS) + r")\b(?! stand)")
@@ -69,7 +70,7 @@ class Exchange:
 
     def ids(self, text: str) -> str:
         """A text with object ids, their types exchanged."""
-        return _ID.sub(lambda match: f"{self._types.get(match[1], match[1])}_{match[2]}", text)
+        return OBJECT_ID.sub(lambda match: f"{self._types.get(match[1], match[1])}_{match[2]}", text)
 
     def words(self, text: str) -> str:
         """An instruction with its names exchanged."""

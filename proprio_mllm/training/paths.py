@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from configs.schema.train import TrainConfig
+from data.files import write_text
 from data.shards import config_hash
 
 __all__ = ["StagePaths", "finish", "finished_key", "stage_key"]
@@ -61,7 +61,5 @@ def finished_key(folder: Path) -> str | None:
 
 def finish(folder: Path, key: str, metrics: Mapping[str, Any], command: str = "") -> None:
     """Marks a stage's output as complete; `command` is the command line that made it."""
-    temporary = folder / "done.json.tmp"
     record = {"key": key, "command": command, "metrics": dict(metrics)}
-    temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, folder / "done.json")
+    write_text(folder / "done.json", json.dumps(record, indent=1) + "\n")

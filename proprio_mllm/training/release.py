@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import platform
 import shutil
 from importlib.metadata import version
@@ -23,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from safetensors.torch import load_file, save_file
 
+from data.files import new_folder
 from proprio_mllm.model.building import share_backbone
 from proprio_mllm.training.paths import finished_key
 from proprio_mllm.training.selu import CRITIC
@@ -71,19 +71,16 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
         if key is None or not source.is_dir() or superseded:
             continue
         target = Path(folder) / pipeline.cfg.model.name / release_name(stage, pipeline.cfg.variant)
-        work = target.with_name(target.name + ".tmp")
-        shutil.rmtree(work, ignore_errors=True)
-        shutil.copytree(source, work)
-        _shrink(work)
-        if stage != "base" and (work / "vlm").is_dir():
-            share_backbone(work, target.with_name(release_name("base", "")))
-        (work / "provenance.json").write_text(json.dumps(_provenance(pipeline, stage, key), indent=1) + "\n", encoding="utf-8")
-        size = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) / 1e6
-        if size > LARGEST_MB:
-            shutil.rmtree(work)
-            raise ValueError(f"{target}: {size:.1f} MB; at most {LARGEST_MB:g} MB are released")
-        shutil.rmtree(target, ignore_errors=True)
-        os.replace(work, target)
+        with new_folder(target) as work:
+            shutil.copytree(source, work, dirs_exist_ok=True)
+            _shrink(work)
+            if stage != "base" and (work / "vlm").is_dir():
+                share_backbone(work, target.with_name(release_name("base", "")))
+            provenance = json.dumps(_provenance(pipeline, stage, key), indent=1)
+            (work / "provenance.json").write_text(provenance + "\n", encoding="utf-8")
+            size = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) / 1e6
+            if size > LARGEST_MB:
+                raise ValueError(f"{target}: {size:.1f} MB; at most {LARGEST_MB:g} MB are released")
         written.append(target)
     return written
 

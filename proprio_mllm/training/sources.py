@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -32,7 +31,7 @@ from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, answers, critic_prompt, named_prompt, plan_prompt, self_ask_prompt, with_answer
 from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
-from proprio_mllm.training.exercises import Exchange, is_symbolic
+from proprio_mllm.training.exercises import OBJECT_ID, Exchange, is_symbolic
 from proprio_mllm.training.states import asked_relation, history_of, open_hands, states_from_log
 
 __all__ = ["Bodies", "Clips", "Demos", "Exercises", "Judgements", "Views", "held_out", "shard_hash", "step_in_words"]
@@ -44,7 +43,6 @@ BODY_RELATIVE = ("arm", "shift")
 #: Shares of exercises: the expert's own logs with names exchanged, which objects an instruction names, which objects are in a
 #: state according to the log. The others ask for the next step of an episode in words.
 FROM_LOGS, NAMING, STATES = 0.2, 0.2, 0.1
-_ID = re.compile(r"[A-Za-z]+_\d+")
 #: Earlier steps that tell what to do next, nearly always.
 _ENOUGH_LOG = 4
 #: Share of corrections among the exercises where there are any.
@@ -118,6 +116,7 @@ class Views:
             if isinstance(self.reader.manifest.metadata["type_names"], str)
             else tuple(self.reader.manifest.metadata["type_names"])
         )
+        self.style: Style = cfg.prompt
         self._cfg = cfg
 
     def row(self, index: int) -> ViewRow:
@@ -148,7 +147,7 @@ class Views:
                     "arm": lambda c=centre: arm_answer(c),
                     "shift": lambda c=centre: shift_answer(c, bodies),
                 }[kind]()
-                found.append((ask(kind, str(thing["id"])), answer))
+                found.append((ask(kind, str(thing["id"]), self.style), answer))
         order = rng.permutation(len(found))[:count]
         return [found[i] for i in order]
 
@@ -156,7 +155,7 @@ class Views:
         """Image to text: the names of the objects in view, nearest to the top-left corner first."""
         visible = [thing for thing in row.objects if int(thing["pixels"]) >= 6]
         ordered = sorted(visible, key=lambda thing: (float(thing["bbox"][0]), float(thing["bbox"][1])))
-        return "see?", answers([str(thing["id"]) for thing in ordered][:8])
+        return ask("see", style=self.style), answers([str(thing["id"]) for thing in ordered][:8])
 
 
 def _planning(
@@ -207,7 +206,7 @@ class _Logs:
         row: Mapping[str, Any] = self._rows[int(index)]
         log = row["history"]
         known = {*row["visible"], *row["known"]}
-        used = set(_ID.findall(" ".join((*(item["step"] for item in log), row["target"]))))
+        used = {match[0] for match in OBJECT_ID.finditer(" ".join((*(item["step"] for item in log), row["target"])))}
         found = [False] * len(log)
         for before in range(int(index) - 1, max(int(index) - len(log), 0) - 1, -1):
             moment: Mapping[str, Any] = self._rows[before]

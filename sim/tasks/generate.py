@@ -25,8 +25,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from data.files import write_text
 from sim.tasks.sample import ROBOTS, sample_task, typical_steps
-from sim.tasks.task import BENCHMARK_PATH, MAX_STEPS, Task, load_benchmark, tasks_text, write_tasks, write_text
+from sim.tasks.task import BENCHMARK_PATH, MAX_STEPS, Task, load_benchmark, tasks_text, write_tasks
 
 __all__ = ["CERTIFICATES_PATH", "SLOTS", "Certificate", "Slot", "budget_of", "certify", "generate", "main", "rebuild"]
 
@@ -254,7 +255,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     tasks, certificates = generate()
     write_tasks(tasks, BENCHMARK_PATH)
-    write_text(_certificates_text(certificates), CERTIFICATES_PATH)
+    write_text(CERTIFICATES_PATH, _certificates_text(certificates))
     sys.stdout.write(f"{len(tasks)} tasks, {len(certificates)} certificates\n")
     return 0
 

@@ -7,7 +7,6 @@ DualTHOR task suite with its categories (single-arm, dual-arm optional, dual-arm
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from configs.validate import build
+from data.files import write_text
 from sim.tasks.predicates import Predicate
 
 __all__ = [
@@ -29,7 +29,6 @@ __all__ = [
     "read_tasks",
     "tasks_text",
     "write_tasks",
-    "write_text",
 ]
 
 BENCHMARK_PATH: Final = Path(__file__).parent / "benchmark.jsonl"
@@ -179,14 +178,7 @@ class Task:
 
 def write_tasks(tasks: Iterable[Task], path: Path) -> None:
     """Writes one JSON object per line, atomically and byte-stable."""
-    write_text(tasks_text(tasks), path)
-
-
-def write_text(text: str, path: Path) -> None:
-    """Writes a text file atomically."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(path, tasks_text(tasks))
 
 
 def tasks_text(tasks: Iterable[Task]) -> str:
