@@ -55,7 +55,7 @@ class Objective(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LoopResult:
-    """What a run did: steps in all, seconds and examples of this process, and the mean of each metric over the last log."""
+    """What a run did: steps and seconds in all, examples of this process, and the mean of each metric over the last log."""
 
     steps: int
     seconds: float
@@ -167,4 +167,4 @@ def run_loop(
             if final:
                 break
     module.eval()
-    return LoopResult(first + counted, time.monotonic() - began, counted * cfg.batch, last)
+    return LoopResult(first + counted, spent + time.monotonic() - began, counted * cfg.batch, last)

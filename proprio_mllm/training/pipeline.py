@@ -132,7 +132,10 @@ class Pipeline:
         raise ValueError(f"stage {name!r} has no key; allowed: {', '.join(STAGES)}")
 
     def run(self, name: str) -> Metrics | None:
-        """Runs a stage unless its output is current; returns its metrics, None when it was skipped."""
+        """Runs a stage unless its output is current; returns its metrics, None when it was skipped.
+
+        `seconds` is the time of this run; those of a loop, which may have been resumed, count its earlier runs too.
+        """
         folder, key = self.paths.stage(name), self.key(name)
         if finished_key(folder) == key and not self.cfg.overwrite:
             logger.info("%s: current, skipped (%s)", name, folder)
@@ -155,7 +158,10 @@ class Pipeline:
         writer = MetricWriter(folder, objective.name, self.cfg.logger, {"key": objective.key})
         try:
             result = run_loop(objective, cfg, folder, self.cfg.seed, writer, self.cfg.resume and not self.cfg.overwrite)
-            self._taken[f"{objective.name}/steps"] = float(result.steps)
+            self._taken |= {
+                f"{objective.name}/steps": float(result.steps),
+                f"{objective.name}/seconds": round(result.seconds, 1),
+            }
         finally:
             writer.close()
 
