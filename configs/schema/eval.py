@@ -26,9 +26,11 @@ class PlannerConfig:
 
     Attributes:
         name: name in commands, ledgers and tables.
-        kind: `mllm` runs a stored model, `random` draws legal actions, `expert` looks into the simulator (privileged).
+        kind: `mllm` runs a stored model, `file` a class in a Python file, `random` draws legal actions, `expert` looks into the
+            simulator (privileged).
         label: name printed in tables.
         weights: folder of a stored model; needed for `mllm`.
+        source: `FILE.py:CLASS`; needed for `file`.
         adapter: adapter to activate; None takes the stored model's first.
         train: command that makes the weights, for the message when they are absent.
         temperature: 0 takes the most likely token.
@@ -37,9 +39,10 @@ class PlannerConfig:
     """
 
     name: str
-    kind: Literal["mllm", "random", "expert"]
+    kind: Literal["mllm", "file", "random", "expert"]
     label: str
     weights: str | None = None
+    source: str | None = None
     adapter: str | None = None
     train: str = ""
     temperature: float = 0.0
@@ -49,6 +52,7 @@ class PlannerConfig:
     def __post_init__(self) -> None:
         _require(self.name.isidentifier(), f"planner name {self.name!r} must be an identifier")
         _require((self.weights is not None) == (self.kind == "mllm"), f"kind {self.kind!r} with weights {self.weights!r}")
+        _require((self.source is not None) == (self.kind == "file"), f"kind {self.kind!r} with source {self.source!r}")
         _require(self.temperature >= 0.0, f"temperature {self.temperature} must not be negative")
         _require(self.max_new_tokens > 0, f"max_new_tokens {self.max_new_tokens} must be positive")
 

@@ -32,6 +32,7 @@ from proprio_mllm.evaluation.pool import run_jobs
 from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWorker, Opener, WorkerSetup, lost_episode
 from proprio_mllm.planners.protocol import check_weights
+from proprio_mllm.planners.registry import make_planner
 from sim.tasks.task import Task, load_benchmark, read_tasks
 
 __all__ = ["RUN_VERSION", "EvalRun", "evaluate", "plan_episodes", "run_folder", "select_tasks", "weights_digest"]
@@ -59,10 +60,10 @@ class EvalRun:
     broken: tuple[EpisodeRecord, ...]
 
 
-def weights_folder(path: str) -> Path:
-    """A weights folder as given, or relative to the project when it is not found from here."""
-    folder = Path(path)
-    return folder if folder.exists() or folder.is_absolute() else _ROOT / folder
+def found(path: str) -> Path:
+    """A path as given, or relative to the project when it is not found from here."""
+    here = Path(path)
+    return here if here.exists() or here.is_absolute() else _ROOT / here
 
 
 def weights_digest(folder: Path) -> str:
@@ -100,7 +101,7 @@ def select_tasks(cfg: EvalConfig) -> tuple[Task, ...]:
 def config_hash(cfg: EvalConfig, digest: str) -> str:
     """Hash of what decides results besides the rest of the episode's key."""
     planner = dataclasses.asdict(cfg.planner)
-    for name in ("label", "train", "weights"):
+    for name in ("label", "train", "weights", "source"):
         del planner[name]
     decides = {"planner": planner, "weights": digest, "robot": dataclasses.asdict(cfg.robot), "start": cfg.start}
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]
@@ -173,10 +174,15 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileg
 
 
 def _resolved(planner: PlannerConfig) -> tuple[PlannerConfig, str]:
-    """The planner with its weights found, and their digest."""
+    """The planner with its weights or its file found, and their digest."""
+    if planner.source is not None:
+        file, _, name = planner.source.rpartition(":")
+        planner = dataclasses.replace(planner, source=f"{found(file).absolute()}:{name}" if file else planner.source)
+        make_planner(planner)  # fails here, with one message, rather than in every worker
+        return planner, hashlib.sha256(f"{file_hash(found(file))}:{name}".encode()).hexdigest()[:16]
     if planner.weights is None:
         return planner, ""
-    folder = check_weights(weights_folder(planner.weights), planner.train)
+    folder = check_weights(found(planner.weights), planner.train)
     return dataclasses.replace(planner, weights=str(folder)), weights_digest(folder)
 
 
@@ -192,6 +198,7 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
 
     Raises:
         WeightsError: when the planner's weights are absent.
+        PlannerFileError: when the planner cannot be made from its file.
         ValueError: when there is no task to run, or `robot.mjcf` is given.
     """
     if cfg.robot.mjcf is not None:

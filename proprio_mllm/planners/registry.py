@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from configs.schema.eval import PlannerConfig
+from proprio_mllm.planners.file_planner import load_planner
 from proprio_mllm.planners.protocol import Planner
 from proprio_mllm.planners.random_planner import RandomPlanner
 
@@ -23,7 +24,12 @@ def _random(cfg: PlannerConfig) -> Planner:
     return RandomPlanner(cfg.image_size)
 
 
-PLANNERS: Final[Mapping[str, Callable[[PlannerConfig], Planner]]] = {"mllm": _mllm, "random": _random}
+def _file(cfg: PlannerConfig) -> Planner:
+    assert cfg.source is not None
+    return load_planner(cfg.source)
+
+
+PLANNERS: Final[Mapping[str, Callable[[PlannerConfig], Planner]]] = {"file": _file, "mllm": _mllm, "random": _random}
 
 
 def make_planner(cfg: PlannerConfig) -> Planner:

@@ -52,7 +52,8 @@ def release_name(stage: str, variant: str) -> str:
 def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
     """Copies the base model and the variant's newest finished model to `folder/<model>/<name>`.
 
-    The model of stage `alignment` is copied only while `selu` has not finished.
+    The model of stage `alignment` is copied only while `selu` has not finished, and the base model only when `folder` does not
+    hold the same one already.
 
     Args:
         pipeline: names folders and keys.
@@ -71,6 +72,8 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
         if key is None or not source.is_dir() or superseded:
             continue
         target = Path(folder) / pipeline.cfg.model.name / release_name(stage, pipeline.cfg.variant)
+        if stage == "base" and _released_key(target) == key:  # every variant's export meets it again
+            continue
         with new_folder(target) as work:
             shutil.copytree(source, work, dirs_exist_ok=True)
             _shrink(work)
@@ -83,6 +86,11 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
                 raise ValueError(f"{target}: {size:.1f} MB; at most {LARGEST_MB:g} MB are released")
         written.append(target)
     return written
+
+
+def _released_key(target: Path) -> str | None:
+    path = target / "provenance.json"
+    return str(json.loads(path.read_text(encoding="utf-8"))["key"]) if path.is_file() else None
 
 
 def _shrink(folder: Path) -> None:

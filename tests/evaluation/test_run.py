@@ -105,6 +105,39 @@ def test_absent_weights_name_path_and_command(cfg, tmp_path) -> None:
         evaluate(dataclasses.replace(cfg, planner=planner))
 
 
+OWN = """
+from dataclasses import dataclass
+from proprio_mllm.planners.protocol import parse_reply
+
+@dataclass
+class {name}:
+    privileged: bool = False
+    image_size: int = 28
+
+    def reset(self, task, rng):
+        self.steps = 0
+
+    def step(self, observation, feedback):
+        self.steps += 1
+        return parse_reply("Done()" if self.steps > {steps} else "GoTo(Table_1)")
+"""
+
+
+def test_a_planner_in_a_file_runs_and_its_edits_count(cfg, session, tmp_path) -> None:
+    path = tmp_path / "own.py"
+    path.write_text(OWN.format(name="First", steps=2) + OWN.format(name="Second", steps=1))
+
+    def run(name: str):
+        planner = PlannerConfig("own", "file", "Own", source=f"{path}:{name}")
+        return evaluate(dataclasses.replace(cfg, planner=planner), lambda setup, job, planner: session())
+
+    first, second = run("First"), run("Second")
+    assert {record.planner for record in first.records} == {"own"}
+    assert all(a.planner_calls > b.planner_calls for a, b in zip(first.records, second.records, strict=True))
+    path.write_text(path.read_text() + "\n# edited\n")
+    assert len({first.folder, second.folder, run("First").folder}) == 3
+
+
 def test_digest_changes_with_the_files(tmp_path) -> None:
     (tmp_path / "config.json").write_text("{}")
     before = weights_digest(tmp_path)

@@ -85,7 +85,7 @@ def test_every_configured_planner_is_made_somewhere() -> None:
 
 def test_registry() -> None:
     assert isinstance(make_planner(PlannerConfig("r", "random", "R", image_size=56)), Planner)
-    with pytest.raises(ValueError, match=r"'expert' is not made here; allowed: mllm, random"):
+    with pytest.raises(ValueError, match=r"'expert' is not made here; allowed: file, mllm, random"):
         make_planner(PlannerConfig("e", "expert", "E"))
 
 
@@ -104,6 +104,8 @@ def test_weights_are_checked(tmp_path: Path) -> None:
         ({"max_new_tokens": 0}, "max_new_tokens 0"),
         ({"name": "a b"}, "'a b'"),
         ({"weights": "x"}, "weights 'x'"),
+        ({"kind": "file"}, "source None"),
+        ({"source": "x.py:X"}, "source 'x.py:X'"),
     ],
 )
 def test_config_refuses(change: dict, message: str) -> None:

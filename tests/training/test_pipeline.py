@@ -290,6 +290,7 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert release.find_model(trained.cfg.output, tmp_path, "tiny", "full", "selu") == trained.paths.model("selu")
     with pytest.raises(FileNotFoundError, match="no selu model of tiny \\(no_cse\\)"):
         release.find_model("nowhere", tmp_path, "tiny", "no_cse", "selu")
+    assert [path.name for path in release.export(trained, tmp_path)] == ["full"], "the base model is there already"
     monkeypatch.setattr(release, "LARGEST_MB", 0.001)
     with pytest.raises(ValueError, match=r"at most 0.001 MB are released"):
         release.export(trained, tmp_path)
