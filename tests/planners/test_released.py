@@ -1,0 +1,64 @@
+"""The weights in the repository: each is what its name says, says where it comes from, and plans."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from configs.schema.robot import RobotConfig
+from data.records import Observation
+from proprio_mllm.evaluation.sessions import open_session
+from proprio_mllm.planners.mllm import MllmPlanner
+from proprio_mllm.planners.protocol import TaskInfo
+from proprio_mllm.planners.random_planner import RandomPlanner
+from sim.tasks.task import load_benchmark
+
+WEIGHTS = Path(__file__).parents[2] / "weights" / "tiny"
+#: Position embedding, cross-spatial encoder, motion tokens.
+PARTS = {
+    "base": ("mrope", False, False),
+    "full": ("rope_sign", True, True),
+    "no_mpe": ("mrope", True, True),
+    "no_cse": ("rope_sign", False, True),
+    "no_mpe_cse": ("mrope", False, True),
+}
+STAGES = ["base", "corrections", "pointmap", "tokenizer", "alignment", "selu"]
+
+
+@pytest.fixture(scope="module")
+def first() -> Observation:
+    """What a planner sees at the start of the benchmark's first task."""
+    task = load_benchmark()[0]
+    return open_session(RobotConfig("h1"), "easy", "fixed", task, 0, RandomPlanner(112)).reset(0)
+
+
+def test_every_folder_is_known() -> None:
+    assert sorted(path.name for path in WEIGHTS.iterdir()) == sorted(PARTS)
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_it_plans_with_the_parts_of_its_name(name: str, first: Observation) -> None:
+    planner = MllmPlanner.load(WEIGHTS / name)
+    cfg = planner.model.cfg
+    assert (cfg.mpe.mode, cfg.cse.enabled, cfg.proprioception) == PARTS[name]
+    planner.reset(TaskInfo(first.instruction, first.robot, first.step_budget), np.random.default_rng(0))
+    reply = planner.step(first, None)
+    assert reply.step is not None, reply.text
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_it_says_where_it_comes_from(name: str) -> None:
+    files = [path for path in (WEIGHTS / name).rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 30e6
+    assert {path.suffix for path in files} <= {".json", ".jinja", ".safetensors"}
+    note = json.loads((WEIGHTS / name / "provenance.json").read_text())
+    assert note["seed"] == 0
+    assert {"views", "demos", "exercises"} <= set(note["shards"])
+    assert list(note["stages"]) == (STAGES[:1] if name == "base" else STAGES)
+    for stage in note["stages"].values():
+        assert stage["command"].startswith("python train.py stage=")
+        assert stage["metrics"]["seconds"] > 0
+    assert name == "base" or note["variant"] == name
