@@ -24,7 +24,17 @@ from sim.session import FreePlay, Session, SessionSnapshot, TaskLike
 
 __all__ = ["Controller", "Event"]
 
-_CONTROL: Final = ("Undo", "Redo", "SaveState", "LoadState", "Reset", "GetReachablePositions", "TP", "Pass")
+#: Arguments of each control action.
+_CONTROL: Final[Mapping[str, tuple[str, ...]]] = {
+    "Undo": (),
+    "Redo": (),
+    "SaveState": ("name",),
+    "LoadState": ("name",),
+    "Reset": ("scene", "seed"),
+    "GetReachablePositions": (),
+    "TP": ("x", "y", "position", "rotation"),
+    "Pass": (),
+}
 _CONTROL_ALIASES: Final[Mapping[str, str]] = {name.lower(): name for name in _CONTROL} | {
     "resetscene": "Reset",
     "getcurstate": "Pass",
@@ -168,6 +178,9 @@ class Controller:
         return self.last_event
 
     def _control(self, name: str, call: Mapping[str, Any]) -> Event:
+        unknown = sorted(set(call) - set(_CONTROL[name]))
+        if unknown:
+            raise ValueError(f"{name}: unknown arguments {unknown}; allowed: {', '.join(_CONTROL[name]) or 'none'}")
         handlers: Mapping[str, Callable[[Mapping[str, Any]], Any]] = {
             "Undo": lambda _: self._travel(self._undo, self._redo),
             "Redo": lambda _: self._travel(self._redo, self._undo),

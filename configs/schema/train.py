@@ -11,7 +11,7 @@ from configs.schema.model import ModelConfig
 __all__ = [
     "AlignmentConfig",
     "BaseConfig",
-    "CollectConfig",
+    "CollectStageConfig",
     "CorrectionsConfig",
     "LoggerConfig",
     "LoopConfig",
@@ -156,7 +156,7 @@ class SeluConfig:
 
 
 @dataclass(frozen=True)
-class CollectConfig:
+class CollectStageConfig:
     """What the simulator writes for training.
 
     Attributes:
@@ -237,7 +237,7 @@ class TrainConfig:
     alignment: AlignmentConfig
     selu: SeluConfig
     data: DataConfig = field(default_factory=DataConfig)
-    collect: CollectConfig = field(default_factory=CollectConfig)
+    collect: CollectStageConfig = field(default_factory=CollectStageConfig)
     corrections: CorrectionsConfig = field(default_factory=CorrectionsConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     output: str = "outputs"

@@ -91,6 +91,10 @@ def test_unknown_actions_and_arguments(controller):
         controller.step(action="Fly")
     with pytest.raises(ValueError, match=r"unknown arguments \['speed'\]"):
         controller.step(action="MoveAhead", speed=3)
+    with pytest.raises(ValueError, match=r"SaveState: unknown arguments \['nam'\]; allowed: name"):
+        controller.step(action="SaveState", nam="before")
+    with pytest.raises(ValueError, match=r"Undo: unknown arguments \['steps'\]; allowed: none"):
+        controller.step("Undo", steps=2)
     with pytest.raises(ValueError, match="arm 'third' is not left or right"):
         to_action("pick", {"objectId": "Mug_1", "arm": "third"})
     with pytest.raises(ValueError, match="width 100 and height 90"):
