@@ -28,7 +28,8 @@ def main(overrides: Sequence[str]) -> int:
         overrides: `key=value` pairs of `configs/eval.yaml`.
 
     Returns:
-        0; 1 when episodes stay without a score, weights are absent or a stored run cannot be read; 2 on a wrong key or value.
+        0; 1 when episodes stay without a score, weights are absent or a table cannot be assembled; 2 on a wrong key, value or
+        ledger.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     console = Console(stderr=True, highlight=False)

@@ -32,7 +32,9 @@ def make_data(cfg: TrainConfig) -> None:
 
     size = dataclasses.replace(cfg.data.replay, image_size=cfg.model.image_size)
     motions = dataclasses.replace(cfg.data, seed=cfg.seed, replay=size)
-    build_clips(motions, StagePaths(cfg).shards("clips"), replay_clip, _progress("clips"), overwrite=cfg.overwrite)
+    done = build_clips(motions, StagePaths(cfg).shards("clips"), replay_clip, _progress("clips"), overwrite=cfg.overwrite)
+    summary = done.metadata["summary"]
+    logger.info("clips: %d kept, %d dropped %s", summary["rows"], summary["dropped"], summary["reasons"] or "")
 
 
 def make_shards(cfg: TrainConfig) -> None:

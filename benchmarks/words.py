@@ -3,7 +3,7 @@
     python benchmarks/words.py outputs/tiny/shared/base/model [more model folders] [--episodes 300]
 
 The episodes are drawn apart from those of training and from the benchmark's tasks, so this is where recipes are compared; a
-model of 7 M parameters takes about a minute on one core. Without motion tokens, which episodes in words do not have.
+model of 6 M parameters takes about a minute on one core. Without motion tokens, which episodes in words do not have.
 """
 
 from __future__ import annotations

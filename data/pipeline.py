@@ -9,7 +9,6 @@ Paper: data preparation for stages 1 and 2 (HumanML3D, PHC filtering, retargetin
 from __future__ import annotations
 
 import dataclasses
-import logging
 import multiprocessing
 import time
 from collections import Counter
@@ -21,7 +20,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from configs.schema.data import DataConfig, ReplayConfig
 from data.filter import apply_phc_list, automatic_rule, gate
@@ -35,9 +33,8 @@ from data.shards import Manifest, ShardWriter, config_hash
 from data.workers import start_worker
 from sim.robots.spec import load_robot
 
-__all__ = ["PartResult", "Pictures", "Replay", "build_clips", "dataset_folder", "part_of_clips", "prepare_clips"]
+__all__ = ["PartResult", "Pictures", "Replay", "build_clips", "dataset_folder", "part_of_clips"]
 
-logger = logging.getLogger(__name__)
 #: Raised when the same configuration gives other shards than before.
 _VERSION: Final = 1
 
@@ -268,39 +265,3 @@ def _summary(notes: dict[str, Any]) -> dict[str, Any]:
         "retarget_ms_per_frame": round(1e3 * sum(p["retarget_s"] for p in parts) / max(1, sum(p["frames"] for p in parts)), 3),
         "metrics": metrics,
     }
-
-
-def prepare_clips(
-    cfg: DataConfig,
-    out: Path,
-    replay: Replay | None = None,
-    *,
-    workers: int | None = None,
-    seed: int | None = None,
-    overwrite: bool = False,
-) -> Manifest:
-    """`build_clips` with a progress bar and a summary in the log: what `train.py stage=data` runs.
-
-    Args:
-        cfg: configuration.
-        out: shard folder.
-        replay: makes pictures.
-        workers: processes, in place of the configuration's.
-        seed: seed, in place of the configuration's.
-        overwrite: start over when the folder holds shards of another configuration.
-    """
-    cfg = dataclasses.replace(cfg, workers=cfg.workers if workers is None else workers, seed=cfg.seed if seed is None else seed)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns) as bar:
-        task = bar.add_task("clips", total=None)
-        manifest = build_clips(cfg, out, replay, lambda done, total: bar.update(task, completed=done, total=total), overwrite)
-    summary = manifest.metadata["summary"]
-    logger.info(
-        "%d clips kept, %d dropped %s, %d without pictures, %.2f ms per frame to retarget",
-        summary["rows"],
-        summary["dropped"],
-        summary["reasons"] or "",
-        summary["without_pictures"],
-        summary["retarget_ms_per_frame"],
-    )
-    return manifest

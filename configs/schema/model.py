@@ -72,7 +72,7 @@ class PointMapConfig:
         checkout: CUT3R's source folder.
         checkpoint: CUT3R's weights.
         sha256: the checksum the user expects of `checkpoint`.
-        trust_checkpoint: must be true to unpickle `checkpoint`.
+        trust_checkpoint: allows unrestricted unpickling of `checkpoint` when the restricted reader refuses it.
         size: side of the image that CUT3R sees, pixels.
     """
 

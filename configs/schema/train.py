@@ -141,7 +141,7 @@ class SeluConfig:
         actor: loop of the actor's fine-tuning.
         truth: `audit` only reports the critic against the simulator; `oracle` lets the simulator judge (a labelled ablation).
         replay_share: share of the batches that is replayed against forgetting: for the actor demonstrations and exercises,
-            for the critic questions about the expert's logs.
+            for the critic judging questions.
         per_class: most kept trajectories per verb, robot and category.
     """
 

@@ -4,8 +4,8 @@ The loop: show the observation, ask for a step, let the session act it out, unti
 the step budget is used up. A reply outside the grammar costs a step and comes back as the code `InvalidOutput`. The runner
 keeps history and step count itself, so that invalid replies are part of both.
 
-This is one of the two places of the project that catch every exception (the other is the command line): whatever breaks in
-simulator or planner becomes an infrastructure error, which is recorded and never scored.
+Every exception is caught here (elsewhere only around a user's planner file): whatever breaks in simulator or planner becomes an
+infrastructure error, which is recorded and never scored.
 """
 
 from __future__ import annotations

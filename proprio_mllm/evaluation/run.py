@@ -33,6 +33,7 @@ from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWorker, Opener, WorkerSetup, lost_episode
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.planners.registry import make_planner
+from sim.robots.spec import load_robot
 from sim.tasks.task import Task, load_benchmark, read_tasks
 
 __all__ = ["RUN_VERSION", "EvalRun", "evaluate", "plan_episodes", "run_folder", "select_tasks", "weights_digest"]
@@ -199,12 +200,13 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
     Raises:
         WeightsError: when the planner's weights are absent.
         PlannerFileError: when the planner cannot be made from its file.
-        ValueError: when there is no task to run, or `robot.mjcf` is given.
+        ValueError: when there is no task to run, the robot's description is wrong, or `robot.mjcf` is given.
     """
     if cfg.robot.mjcf is not None:
         raise ValueError(
             f"robot.mjcf={cfg.robot.mjcf!r}: episodes take another MJCF through a description, robot.spec=FILE.yaml"
         )
+    load_robot(cfg.robot.spec or cfg.robot.name)  # a wrong description stops here, not in every episode
     planner, digest = _resolved(cfg.planner)
     jobs = plan_episodes(cfg, select_tasks(cfg), digest)
     folder = run_folder(cfg, digest)

@@ -6,7 +6,7 @@ import pytest
 
 from configs.schema.data import DataConfig, GateConfig, ReplayConfig
 from data.humanml3d import DatasetError
-from data.pipeline import Pictures, build_clips, dataset_folder, prepare_clips
+from data.pipeline import Pictures, build_clips, dataset_folder
 from data.records import Motion
 from data.shards import ShardError, ShardReader, decode_motion, encode_png
 
@@ -58,7 +58,7 @@ def test_resumes(tmp_path: Path) -> None:
 
 def test_dropped_clips_have_a_reason(tmp_path: Path) -> None:
     strict = dataclasses.replace(CFG, gates=GateConfig(leg_deg=0.01))
-    manifest = prepare_clips(strict, tmp_path / "clips", None, workers=1, seed=0)
+    manifest = build_clips(strict, tmp_path / "clips", None)
     assert manifest.rows == 0
     assert manifest.metadata["summary"]["reasons"] == {"leg_deg": 4}
     names = [entry[0] for part in manifest.metadata["parts"].values() for entry in part["dropped"]]

@@ -46,6 +46,7 @@ def test_every_experiment_composes_with_known_planners(name: str) -> None:
         ("planner.image_size=big", "big"),
         ("tasks=/nowhere/tasks.jsonl", "nowhere"),
         ("robot.mjcf=/tmp/x.xml", "robot.spec"),
+        ("robot.spec=typo.yaml", "allowed: h1, x1"),
     ],
 )
 def test_wrong_words_stop_with_what_is_allowed(
