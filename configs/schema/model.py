@@ -21,6 +21,8 @@ __all__ = [
 ]
 
 MpeMode = Literal["mrope", "rope_sign", "rope_sign_raw", "rope_radial", "embed_sign", "rope_sign+embed"]
+#: Frames of proprioception in shards and observations.
+LONGEST_WINDOW = 64
 CentroidName = Literal["body", "arms", "reach"]
 
 
@@ -138,6 +140,7 @@ class MotionTokenizerConfig:
     def __post_init__(self) -> None:
         for name in ("features", "window", "codes", "code_dim", "width", "depth", "dilation", "down"):
             _require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
+        _require(self.window <= LONGEST_WINDOW, f"window {self.window} must be at most {LONGEST_WINDOW}, what shards hold")
         _require(self.window % self.stride == 0, f"window {self.window} must be a multiple of {self.stride}")
 
     @property

@@ -21,6 +21,8 @@ __all__ = [
     "Variant",
 ]
 
+#: Training tasks have 2^31 seeds, a million for each seed of a run.
+LARGEST_SEED = 2000
 StageName = Literal["all", "data", "collect", "base", "corrections", "pointmap", "tokenizer", "alignment", "selu"]
 Variant = Literal["full", "no_mpe", "no_cse", "no_mpe_cse", "no_proprio"]
 
@@ -154,6 +156,12 @@ class SeluConfig:
     replay_share: float = 0.5
     per_class: int = 40
 
+    def __post_init__(self) -> None:
+        _require_shares(self, "replay_share")
+        for name in ("rounds", "episodes", "per_class"):
+            _require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
+        _require(self.temperature > 0.0, f"temperature {self.temperature} must be positive: exploration needs draws")
+
 
 @dataclass(frozen=True)
 class CollectStageConfig:
@@ -246,3 +254,6 @@ class TrainConfig:
     overwrite: bool = False
     release: str | None = None
     resume: bool = True
+
+    def __post_init__(self) -> None:
+        _require(0 <= self.seed <= LARGEST_SEED, f"seed {self.seed} outside [0, {LARGEST_SEED}]")

@@ -11,6 +11,7 @@ pretrained backbone reads feedback in plain words already.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import multiprocessing
 import os
@@ -65,13 +66,28 @@ def _computed(
     """Parts as they are finished."""
     if workers == 1 or len(missing) < 2:
         for part in missing:
-            yield part, _part(config, part, model)
+            with _one_thread():
+                rows = _part(config, part, model)
+            yield part, rows
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, len(missing)), mp_context=context, initializer=start_worker) as pool:
         futures = {pool.submit(_part, config, part, model): part for part in missing}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """One torch thread, as in a worker process: the number of threads decides the order of sums, and training has its own."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _part(config: CollectConfig, part: int, model: str) -> list[dict[str, Any]]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -170,8 +171,10 @@ def _loop(
             watch(shown, reply, feedback)
         reply = planner.step(shown, None if feedback is None else feedback.public())
         tally.calls += 1
-        tally.tokens += reply.tokens
-        tally.planner_s += reply.latency_s
+        if not math.isfinite(reply.latency_s):
+            raise ValueError(f"the reply's latency_s is {reply.latency_s}; allowed: seconds")
+        tally.tokens += int(reply.tokens)  # a planner may count in NumPy
+        tally.planner_s += float(reply.latency_s)
         if reply.step is None:
             feedback = None
             tally.invalid += 1

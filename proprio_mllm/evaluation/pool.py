@@ -104,8 +104,9 @@ def _run_pool(
     try:
         while queue or running:
             while queue and len(running) < workers:
-                attempt = queue.pop(0)
-                running[pool.submit(_do, attempt.job)] = attempt
+                attempt = queue[0]
+                running[pool.submit(_do, attempt.job)] = attempt  # raises when a process has died: the attempt stays queued
+                queue.pop(0)
             ready, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in ready:
                 attempt = running[future]

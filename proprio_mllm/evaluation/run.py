@@ -31,6 +31,7 @@ from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledg
 from proprio_mllm.evaluation.pool import run_jobs
 from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWorker, Opener, WorkerSetup, lost_episode
+from proprio_mllm.planners.file_planner import source_digest
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.planners.registry import make_planner
 from sim.robots.spec import load_robot
@@ -180,7 +181,8 @@ def _resolved(planner: PlannerConfig) -> tuple[PlannerConfig, str]:
         file, _, name = planner.source.rpartition(":")
         planner = dataclasses.replace(planner, source=f"{found(file).absolute()}:{name}" if file else planner.source)
         make_planner(planner)  # fails here, with one message, rather than in every worker
-        return planner, hashlib.sha256(f"{file_hash(found(file))}:{name}".encode()).hexdigest()[:16]
+        assert planner.source is not None
+        return planner, source_digest(planner.source)
     if planner.weights is None:
         return planner, ""
     folder = check_weights(found(planner.weights), planner.train)

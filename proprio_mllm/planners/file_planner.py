@@ -6,15 +6,17 @@ planner sees, observations and feedback. The file runs with the rights of the us
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import inspect
 import sys
 from pathlib import Path
 from types import ModuleType
 
+from data.files import file_hash
 from proprio_mllm.planners.protocol import Planner
 
-__all__ = ["PlannerFileError", "load_planner", "split_source"]
+__all__ = ["PlannerFileError", "load_planner", "source_digest", "split_source"]
 
 
 class PlannerFileError(ValueError):
@@ -59,6 +61,16 @@ def load_planner(source: str) -> Planner:
     if planner.privileged:
         raise PlannerFileError(f"{path}: {name}.privileged must be False: a planner from a file sees observations only")
     return planner
+
+
+def source_digest(source: str) -> str:
+    """Short hash of a loaded planner's file, its class's name, and the modules beside and below it that are imported."""
+    path, name = split_source(source)
+    root = path.resolve().parent
+    loaded = {Path(file).resolve() for module in list(sys.modules.values()) if (file := getattr(module, "__file__", None))}
+    beside = {file for file in loaded if file.is_relative_to(root) and "site-packages" not in file.parts}
+    parts = [f"{file.relative_to(root)} {file_hash(file)}" for file in sorted({path.resolve(), *beside})]
+    return hashlib.sha256("\n".join([*parts, name]).encode()).hexdigest()[:16]
 
 
 def _module(path: Path) -> ModuleType:

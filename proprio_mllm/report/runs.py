@@ -124,7 +124,7 @@ def write_report(run: Run) -> Table:
 
 
 def newest(runs: Sequence[Run], planner: str, robot: str, difficulty: str, category: str = "all") -> Run | None:
-    """The run to show in a cell: of these settings, with tasks of the category, the one with most episodes, then the newest.
+    """The run to show in a cell: of these settings, the one with most episodes of the category, then the newest.
 
     Runs over a part of the tasks (`limit`) or from other start poses are left out.
     """
@@ -133,6 +133,8 @@ def newest(runs: Sequence[Run], planner: str, robot: str, difficulty: str, categ
         for run in runs
         if (run.metadata["planner"], run.metadata["robot"], run.metadata["difficulty"]) == (planner, robot, difficulty)
         and (run.metadata["tasks"], run.metadata["limit"], run.metadata["start"]) == ("benchmark", None, "fixed")
-        and run.row(category) is not None
+        and run.metadata["category"] in ("all", category)
     ]
-    return max(fitting, key=lambda run: len(run.records), default=None)  # `runs` is newest first, and max keeps the first
+    rows = [(run, run.row(category)) for run in fitting]
+    sized = [(run, row.episodes) for run, row in rows if row is not None]
+    return max(sized, key=lambda pair: pair[1], default=(None, 0))[0]  # `runs` is newest first, and max keeps the first

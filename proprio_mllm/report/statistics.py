@@ -91,10 +91,9 @@ def rate_interval(by_task: Mapping[str, Sequence[bool]], confidence: float = 0.9
         return Interval(float("nan"), float("nan"), float("nan"), "none")
     values = [value for cluster in clusters for value in cluster]
     rate = float(np.mean(values))
-    equal_sizes = len({len(cluster) for cluster in clusters}) == 1
-    if equal_sizes and all(len(set(cluster)) == 1 for cluster in clusters):
+    if all(len(set(cluster)) == 1 for cluster in clusters):
         low, high = wilson(sum(int(cluster[0]) for cluster in clusters), len(clusters), confidence)
-        return Interval(rate, low, high, "wilson")
+        return Interval(rate, min(low, rate), max(high, rate), "wilson")  # with unequal sizes the two need not agree
     low, high = cluster_bootstrap(clusters, np.random.default_rng(0), confidence)
     return Interval(rate, low, high, "bootstrap")
 

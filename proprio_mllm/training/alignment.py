@@ -84,6 +84,8 @@ class AlignmentData:
         self.bodies = None if self._demo_tokens is None else Bodies(demos, self._demo_tokens)
         with_images = [i for i, images in enumerate(clips.reader.column("image_frames")) if images]
         self._pictured = np.intersect1d(np.asarray(with_images, dtype=np.int64), clips.split.train)
+        if self._proprioception and not len(self._pictured):
+            raise ValueError("no training clip has pictures; alignment needs stage=data with data.replay.enabled=true")
 
     def _encode(self, windows: NDArray[np.float32]) -> list[list[int]]:
         return self.tokenizer.encode(torch.from_numpy(windows).to(self.tokenizer.mean.device)).tolist()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -144,6 +145,7 @@ class Pipeline:
             if finished_key(self.paths.stage(needed)) != self.key(needed):
                 raise StageError(f"stage {name!r} needs the output of {needed!r}; run `python train.py stage={needed}` first")
         folder.mkdir(parents=True, exist_ok=True)
+        (folder / "done.json").unlink(missing_ok=True)  # from here on the folder's content is no finished stage's
         began = time.monotonic()
         self._taken.clear()
         metrics = STAGES[name](self, folder, key) | self._taken
@@ -203,7 +205,7 @@ class Pipeline:
         texts = corpus(plain, views, demos, exercises, clips, cfg.seed)
         model = build_model(plain, build_processor(plain, texts, whole_words(views)), cfg.seed)
         start_from_words(model, views.type_names)
-        head = DenseHead(model, views.type_names)
+        head = _seeded(lambda: DenseHead(model, views.type_names), cfg.seed)
         model.requires_grad_(True)
         dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
         self._train_dense(dense, model, head, folder / "dense")
@@ -242,6 +244,8 @@ class Pipeline:
         if self._correct is None:
             raise ValueError("stage 'corrections' needs the simulator: no collector was given")
         cfg, shards = self.cfg.corrections, self.paths.shards(name)
+        if self.cfg.overwrite:  # the base model may be another one under the same key
+            shutil.rmtree(shards, ignore_errors=True)
         written = config_hash({"key": self.corrections[name]})
         size, seed = self.cfg.model.image_size, self.cfg.seed
         request = CorrectionRequest(self.paths.model("base"), shards, kind, episodes, seed, cfg.expert_share, size, written)
@@ -255,7 +259,7 @@ class Pipeline:
         self.loop(objective, self.cfg.base.dense, folder)
 
     def _pointmap(self, folder: Path, key: str) -> Metrics:
-        encoder = build_point_map(dataclasses.replace(self.cfg.model))
+        encoder = _seeded(lambda: build_point_map(self.cfg.model), self.cfg.seed)
         if encoder is None or not list(encoder.parameters()):
             return {}
         views = Views(self.paths.shards("views"), self.cfg.model)

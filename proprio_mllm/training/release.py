@@ -52,8 +52,8 @@ def release_name(stage: str, variant: str) -> str:
 def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
     """Copies the base model and the variant's newest finished model to `folder/<model>/<name>`.
 
-    The model of stage `alignment` is copied only while `selu` has not finished, and the base model only when `folder` does not
-    hold the same one already.
+    What rests on a stage that has not finished under this configuration is left out. The model of stage `alignment` is copied
+    only while `selu` has not finished, and the base model only when `folder` does not hold the same one already.
 
     Args:
         pipeline: names folders and keys.
@@ -65,12 +65,17 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
     Raises:
         ValueError: when a folder would be larger than `LARGEST_MB`.
     """
-    paths, written = pipeline.paths, []
+    paths, written = pipeline.paths, list[Path]()
+
+    def current(stage: str) -> bool:
+        done = finished_key(paths.stage(stage))
+        return done is not None and done == pipeline.key(stage)
+
     for stage in _MODELS:
-        source, key = paths.model(stage), finished_key(paths.stage(stage))
-        superseded = stage == "alignment" and finished_key(paths.stage("selu")) is not None
-        if key is None or not source.is_dir() or superseded:
+        source = paths.model(stage)
+        if not source.is_dir() or not all(map(current, _CHAIN[stage])) or (stage == "alignment" and current("selu")):
             continue
+        key = pipeline.key(stage)
         target = Path(folder) / pipeline.cfg.model.name / release_name(stage, pipeline.cfg.variant)
         if stage == "base" and _released_key(target) == key:  # every variant's export meets it again
             continue

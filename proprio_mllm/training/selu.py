@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -184,6 +185,9 @@ class _Selu:
         if finished_key(folder) == key and not self.pipeline.cfg.overwrite:
             logger.info("selu: round %d is complete", number)
             return json.loads((folder / "done.json").read_text(encoding="utf-8"))["metrics"]
+        (folder / "done.json").unlink(missing_ok=True)
+        if self.pipeline.cfg.overwrite:  # the actor may be another one under the same key
+            shutil.rmtree(folder / "rollouts", ignore_errors=True)
         before = self.start if number == 0 else self.folder / f"round_{number - 1}" / "model"
         seed = self.pipeline.cfg.seed * 1000 + number
         request = RolloutRequest(

@@ -283,7 +283,8 @@ class Demos:
         """Motion tokens (N, T / stride) of every row's window."""
         with torch.no_grad():
             device = tokenizer.mean.device
-            parts = [torch.from_numpy(self.motions[i : i + 256]).to(device) for i in range(0, len(self.motions), 256)]
+            newest = self.motions[:, -tokenizer.cfg.window :]
+            parts = [torch.from_numpy(newest[i : i + 256]).to(device) for i in range(0, len(newest), 256)]
             return torch.cat([tokenizer.encode(part) for part in parts]).cpu().numpy()
 
     def example(self, index: int, motion: Sequence[int] | None, answered: bool = True) -> Example:

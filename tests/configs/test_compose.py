@@ -50,6 +50,10 @@ def test_every_yaml_composes(path: Path) -> None:
         ("eval", "trials=0", r"trials 0 must be positive"),
         ("train", "alignment.mask=1.5", r"mask 1\.5 outside \[0, 1\]"),
         ("eval", "trials", r"override 'trials': expected key=value"),
+        ("train", "seed=12345", r"seed 12345 outside \[0, 2000\]"),
+        ("train", "selu.rounds=0", r"rounds 0 must be positive"),
+        ("train", "selu.temperature=0", r"temperature 0\.0 must be positive"),
+        ("train", "model.motion.window=128", r"window 128 must be at most 64"),
         ("eval", "planner.colour=red", r"planner\.colour: unknown key"),
     ],
 )

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from configs.schema.collect import CollectConfig
 from data.records import Observation, PlanStep
@@ -76,6 +77,18 @@ def test_corrections_in_words_are_exercises(in_words: CorrectionRequest) -> None
     for row in rows:
         for before, after in pairwise(row["history"]):
             assert before["feedback"].endswith(" ok") or before["step"] != after["step"] or after["step"] == row["target"]
+
+
+def test_training_keeps_its_threads(in_words: CorrectionRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    threads, seen = torch.get_num_threads(), list[int]()
+    asked = corrections._part
+    monkeypatch.setattr(corrections, "_part", lambda *job: (seen.append(torch.get_num_threads()), asked(*job))[1])
+    try:
+        torch.set_num_threads(2)
+        collect_corrections(in_words, workers=1)
+        assert (set(seen), torch.get_num_threads()) == ({1}, 2)
+    finally:
+        torch.set_num_threads(threads)
 
 
 def test_the_expert_alone_solves_episodes_in_words(in_words: CorrectionRequest) -> None:

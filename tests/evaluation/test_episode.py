@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import numpy as np
 import pytest
 
 from data.records import FailureCategory, Outcome
 from proprio_mllm.evaluation.episode import run_episode
+from proprio_mllm.evaluation.ledger import Ledger
 
 SOLVED = ("GoTo(Mug_1)", "MoveDown(0.2)", "Pick(left, Mug_1)")
 
@@ -79,6 +83,23 @@ def test_errors_are_recorded_not_scored(session, scripted, fields) -> None:
     assert record.failure is None
     assert "the physics exploded" in record.message
     assert record.steps == 1
+
+
+@pytest.mark.parametrize(
+    ("seconds", "outcome"), [(np.float32(0.5), Outcome.SUCCESS), (float("nan"), Outcome.INFRASTRUCTURE_ERROR)]
+)
+def test_a_planner_may_count_in_numpy_but_not_in_nan(session, scripted, fields, tmp_path, seconds, outcome) -> None:
+    planner = scripted(*SOLVED)
+    said = planner.step
+    planner.step = lambda *seen: dataclasses.replace(said(*seen), tokens=np.int64(7), latency_s=seconds)
+    record = play(session(), planner, fields)
+    assert record.outcome is outcome
+    with Ledger(tmp_path / "ledger.jsonl") as ledger:
+        ledger.append(record)
+    if outcome is Outcome.SUCCESS:
+        assert (record.planner_tokens, record.planner_s) == (21, 1.5)
+    else:
+        assert "latency_s is nan" in record.message
 
 
 def test_an_error_while_opening_is_recorded_too(scripted, fields) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data.records import Camera, Observation, Proprioception
-from proprio_mllm.planners.file_planner import PlannerFileError, load_planner
+from proprio_mllm.planners.file_planner import PlannerFileError, load_planner, source_digest
 from proprio_mllm.planners.protocol import TaskInfo
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_planner.py"
@@ -35,6 +35,25 @@ def test_a_file_may_import_its_neighbour(tmp_path: Path) -> None:
     (tmp_path / "sizes_of_mine.py").write_text("SIZE = 84\n")
     (tmp_path / "own.py").write_text("from sizes_of_mine import SIZE\n" + GOOD.replace("56", "SIZE"))
     assert load_planner(f"{tmp_path / 'own.py'}:Good").image_size == 84
+
+
+def test_the_digest_sees_the_file_its_class_and_its_neighbours(tmp_path: Path) -> None:
+    path, neighbour = tmp_path / "digested.py", tmp_path / "rules_of_mine.py"
+    neighbour.write_text("SIZE = 84\n")
+    (tmp_path / "unrelated.py").write_text("")
+    path.write_text("from rules_of_mine import SIZE\n" + GOOD)
+
+    def digest(name: str = "Good") -> str:
+        load_planner(f"{path}:Good")
+        return source_digest(f"{path}:{name}")
+
+    first = digest()
+    (tmp_path / "unrelated.py").write_text("# edited\n")
+    assert digest() == first
+    neighbour.write_text("SIZE = 85\n")
+    second = digest()
+    path.write_text(path.read_text() + "# edited\n")
+    assert len({first, second, digest(), digest("Other")}) == 4
 
 
 @pytest.mark.parametrize(

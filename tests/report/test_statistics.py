@@ -50,6 +50,13 @@ def test_disagreeing_trials_bootstrap_over_tasks() -> None:
     assert rate_interval(tasks) == interval
 
 
+def test_one_missing_trial_does_not_make_an_interval_a_point() -> None:
+    by_task = {f"t{i}": [False] * 3 for i in range(36)} | {"t0": [False] * 2}
+    interval = rate_interval(by_task)
+    assert (interval.rate, interval.low) == (0.0, 0.0)
+    assert interval.high == pytest.approx(wilson(0, 36)[1])
+
+
 def test_no_episode_is_no_number() -> None:
     interval = rate_interval({})
     assert interval.method == "none"

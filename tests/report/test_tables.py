@@ -12,9 +12,10 @@ from rich.console import Console
 
 from configs.schema.eval import ExperimentConfig
 from data.records import FailureCategory, Outcome
+from proprio_mllm.evaluation.ledger import Ledger
 from proprio_mllm.report import paper
 from proprio_mllm.report.experiments import EXPERIMENTS, ablation_table, assemble, main_table, replanning_table
-from proprio_mllm.report.runs import find_runs, load_run, write_report
+from proprio_mllm.report.runs import find_runs, load_run, newest, write_report
 from proprio_mllm.report.statistics import wilson
 from proprio_mllm.report.summary import rows_of
 from proprio_mllm.report.table import Table, rate_cell, run_table
@@ -55,6 +56,21 @@ def test_report_files_agree_and_end_with_all(tmp_path, run) -> None:
     buffer = io.StringIO()
     table.show(Console(file=buffer, width=140))
     assert buffer.getvalue().rstrip().splitlines()[-1].lstrip().startswith("all")
+
+
+def test_a_run_over_one_category_stands_for_that_category_only(tmp_path, run, record) -> None:
+    full = run(tmp_path)
+    part = tmp_path / "eval" / "part"
+    meta = json.loads((full / "run.json").read_text()) | {"category": "essential"}
+    records = [record(f"t{task}", "essential", False, trial) for task in (2, 5, 8, 11) for trial in range(4)]
+    with Ledger(part / "ledger.jsonl") as ledger:
+        for one in records:
+            ledger.append(one)
+    meta["planned"] = [[one.task, one.category, one.trial, one.config_hash] for one in records]
+    (part / "run.json").write_text(json.dumps(meta))
+    runs = find_runs(tmp_path)
+    chosen = [newest(runs, "random", "h1", "easy", category) for category in ("all", "single", "essential")]
+    assert [one and one.folder.name for one in chosen] == [full.name, full.name, "part"]
 
 
 def test_privileged_runs_say_so(tmp_path, run) -> None:

@@ -262,6 +262,39 @@ def test_variants() -> None:
         variant_model(model, "half")
 
 
+def test_the_same_seed_gives_the_same_weights(trained: Pipeline, shards: Path, tmp_path: Path) -> None:
+    """Initial weights included: whatever was drawn before, here a number, makes no difference."""
+    torch.manual_seed(12345)
+    shutil.copytree(shards, tmp_path / "tiny" / "data")
+    again = Pipeline(dataclasses.replace(trained.cfg, output=str(tmp_path)), collect, "", correct)
+    for stage in ("base", "corrections", "pointmap", "tokenizer", "alignment"):
+        again.run(stage)
+        torch.rand(1)
+    files = [path.relative_to(tmp_path) for path in sorted((tmp_path / "tiny").rglob("*.safetensors"))]
+    assert {path.parts[2] for path in files} == {"base", "pointmap", "tokenizer", "alignment"}
+    for path in files:
+        ours, theirs = load_file(tmp_path / path), load_file(Path(trained.cfg.output) / path)
+        assert ours.keys() == theirs.keys()
+        assert all(torch.equal(tensor, theirs[name]) for name, tensor in ours.items()), path
+
+
+def test_a_stage_that_is_stopped_is_not_finished(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even under the configuration that had finished: the folder holds something else by now."""
+    shutil.copytree(trained.cfg.output, tmp_path / "run")
+    cfg = dataclasses.replace(trained.cfg, output=str(tmp_path / "run"))
+    longer = Pipeline(dataclasses.replace(cfg, pointmap=dataclasses.replace(cfg.pointmap, steps=9)))
+    monkeypatch.setattr(longer, "loop", _stopped)
+    with pytest.raises(KeyboardInterrupt):
+        longer.run("pointmap")
+    with pytest.raises(StageError, match=r"run `python train\.py stage=pointmap` first"):
+        Pipeline(dataclasses.replace(cfg, overwrite=True)).run("alignment")
+    assert [path.name for path in release.export(Pipeline(cfg), tmp_path / "weights")] == ["base"]
+
+
+def _stopped(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
 def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written = release.export(trained, tmp_path)
     assert [folder.name for folder in written] == ["base", "full"]
