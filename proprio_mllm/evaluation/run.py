@@ -31,7 +31,7 @@ from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledg
 from proprio_mllm.evaluation.pool import run_jobs
 from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWorker, Opener, WorkerSetup, lost_episode
-from proprio_mllm.planners.file_planner import source_digest
+from proprio_mllm.planners.file_planner import source_digest, split_source
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.planners.registry import make_planner
 from sim.robots.spec import load_robot
@@ -178,11 +178,11 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileg
 def _resolved(planner: PlannerConfig) -> tuple[PlannerConfig, str]:
     """The planner with its weights or its file found, and their digest."""
     if planner.source is not None:
-        file, _, name = planner.source.rpartition(":")
-        planner = dataclasses.replace(planner, source=f"{found(file).absolute()}:{name}" if file else planner.source)
+        file, name = split_source(planner.source)
+        source = f"{found(str(file)).absolute()}:{name}"
+        planner = dataclasses.replace(planner, source=source)
         make_planner(planner)  # fails here, with one message, rather than in every worker
-        assert planner.source is not None
-        return planner, source_digest(planner.source)
+        return planner, source_digest(source)
     if planner.weights is None:
         return planner, ""
     folder = check_weights(found(planner.weights), planner.train)

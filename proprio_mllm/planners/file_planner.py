@@ -27,13 +27,11 @@ def split_source(source: str) -> tuple[Path, str]:
     """File and class of `FILE.py:CLASS`.
 
     Raises:
-        PlannerFileError: when it is not of that form, or there is no such file.
+        PlannerFileError: when it is not of that form.
     """
     file, _, name = source.rpartition(":")
     if not file.endswith(".py") or not name.isidentifier():
         raise PlannerFileError(f"planner.source={source!r} is not allowed; allowed: FILE.py:CLASS")
-    if not Path(file).is_file():
-        raise PlannerFileError(f"planner.source={source!r}: there is no file {file}")
     return Path(file), name
 
 
@@ -44,6 +42,8 @@ def load_planner(source: str) -> Planner:
         PlannerFileError: when the file cannot be run, or has no such class, or the class is no planner.
     """
     path, name = split_source(source)
+    if not path.is_file():
+        raise PlannerFileError(f"planner.source={source!r}: there is no file {path}")
     module = _module(path)
     found = getattr(module, name, None)
     if not inspect.isclass(found):
