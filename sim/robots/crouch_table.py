@@ -67,10 +67,14 @@ class CrouchTable:
         out[self._legs] = self.legs(pelvis_height_m)
         return out
 
+    def posture(self, pelvis_height_m: float) -> Array:
+        """(J,) joints at a height, arms at rest."""
+        return self.apply(self._posture, pelvis_height_m)
+
     def at(self, pelvis_height_m: float) -> Crouch:
-        """The posture at a height, arms at rest."""
+        """The posture at a height with its balance, arms at rest."""
         height = self.clamp(pelvis_height_m)
-        q = self.apply(self._posture, height)
+        q = self.posture(height)
         return Crouch(q, height, self.pitch(height), 0.0, self.balance_margin(q, height))
 
     def balance_margin(self, q: Array, pelvis_height_m: float) -> float:

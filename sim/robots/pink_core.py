@@ -9,12 +9,15 @@ centre-of-mass task. Legs and lean are those of the crouch at the given pelvis h
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from ctypes import c_int
+from dataclasses import dataclass
 
+import daqp
 import numpy as np
 import pink
 import pinocchio as pin
 from numpy.typing import NDArray
-from pink.limits import ConfigurationLimit, VelocityLimit
+from pink.limits import ConfigurationLimit, Limit, VelocityLimit
 from pink.tasks import ComTask, FrameTask, PostureTask
 
 from sim.robots.crouch_table import CrouchTable
@@ -37,6 +40,47 @@ _STALL_FRACTION = 4e-3
 #: Orientation weights are scaled by these in turn while the position is not reached: a hand may turn in order to reach.
 _RELAXATIONS = (1.0, 0.1, 0.0)
 _BANK_SIZE = 160
+#: Heights whose reduced models are kept.
+_CACHED = 256
+#: What the solver takes for minus infinity.
+_UNBOUNDED = -1e30
+
+
+class _JointLimits(Limit):
+    """Pink's limits of joint positions and velocities, with the part that does not depend on the configuration kept."""
+
+    def __init__(self, model: pin.Model) -> None:
+        position, velocity = ConfigurationLimit(model), VelocityLimit(model)
+        self._model = model
+        self._columns = position.indices
+        self._gain = position.config_limit_gain
+        if position.projection_matrix is None or velocity.projection_matrix is None:
+            raise ValueError("a robot whose movable joints have no limits cannot be solved for")
+        rows = (position.projection_matrix, velocity.projection_matrix)
+        self._matrix: Array = np.vstack([sign * part for part in rows for sign in (1.0, -1.0)])
+        self._step: Array = np.tile(velocity.velocity_limit[velocity.indices], 2)
+
+    def compute_qp_inequalities(self, configuration: pink.Configuration, dt: float) -> tuple[Array, Array]:
+        """See `pink.limits.Limit`."""
+        up = pin.difference(self._model, configuration.q, self._model.upperPositionLimit)[self._columns]
+        down = pin.difference(self._model, configuration.q, self._model.lowerPositionLimit)[self._columns]
+        return self._matrix, np.concatenate([self._gain * up, -(self._gain * down), dt * self._step])
+
+
+@dataclass(frozen=True, slots=True)
+class _Reduced:
+    """The movable joints' own model at one pelvis height.
+
+    Attributes:
+        model, data: Pinocchio's.
+        order: (movable,) where each movable joint is in the model's configuration.
+        limits: of the model.
+    """
+
+    model: pin.Model
+    data: pin.Data
+    order: NDArray[np.int64]
+    limits: _JointLimits
 
 
 class PinkCore:
@@ -51,29 +95,30 @@ class PinkCore:
         locked = [model.getJointId(name) for name in model.names[2:] if name not in set(movable)]
         self._full_names = list(movable)
         self._locked = locked
-        self._reduced: dict[int, tuple[pin.Model, pin.Data, NDArray[np.int64]]] = {}
+        self._reduced: dict[float, _Reduced] = {}
         low, high = robot.lower[self._movable], robot.upper[self._movable]
         centre = robot.arm_posture(robot.posture(), "carry")[self._movable]
         spread = np.random.default_rng(0).uniform(-1.6, 1.6, (_BANK_SIZE, len(low)))
         self._bank: Array = np.clip(centre + spread, low + 1e-3, high - 1e-3)  # (B, movable) postures to restart from
         self._owner = np.array([self._arm_of(name) for name in self._full_names])
 
-    def _model_at(self, pelvis_height_m: float) -> tuple[pin.Model, pin.Data, NDArray[np.int64], float]:
-        """Reduced model with the root and all other joints locked at the crouch; cached by height."""
-        crouch = self._crouches.at(pelvis_height_m)
-        key = round(pelvis_height_m * 1e6)
-        if key not in self._reduced:
-            root = np.array([0.0, 0.0, 0.0, *root_quaternion(0.0, crouch.pelvis_pitch_rad)])
-            reference = self.robot.configuration(root, crouch.q)
+    def _model_at(self, pelvis_height_m: float) -> _Reduced:
+        """Reduced model with the root and all other joints locked at the crouch.
+
+        The cache asks for the very same height: what is solved must not depend on what was solved before.
+        """
+        height = self._crouches.clamp(pelvis_height_m)
+        if height not in self._reduced:
+            root = np.array([0.0, 0.0, 0.0, *root_quaternion(0.0, self._crouches.pitch(height))])
+            reference = self.robot.configuration(root, self._crouches.posture(height))
             root_id = 1
             reduced = pin.buildReducedModel(self.robot.model, [root_id, *self._locked], reference)
             reduced.velocityLimit = np.full(reduced.nv, _STEP_RAD / _DT_S)
             order = np.array([reduced.joints[reduced.getJointId(name)].idx_q for name in self._full_names])
-            if len(self._reduced) > 256:
+            if len(self._reduced) >= _CACHED:
                 self._reduced.clear()
-            self._reduced[key] = (reduced, reduced.createData(), order)
-        model, data, order = self._reduced[key]
-        return model, data, order, crouch.pelvis_pitch_rad
+            self._reduced[height] = _Reduced(reduced, reduced.createData(), order, _JointLimits(reduced))
+        return self._reduced[height]
 
     def solve(
         self,
@@ -88,7 +133,7 @@ class PinkCore:
         unknown = sorted(set(targets) - set(self.robot.spec.arms))
         if unknown or not targets:
             raise ValueError(f"targets for arms {unknown or 'none'}; allowed: left, right")
-        model, data, order, _ = self._model_at(pelvis_height_m)
+        reduced = self._model_at(pelvis_height_m)
         q = np.asarray(q, dtype=float)
         lower, upper = self.robot.lower[self._movable], self.robot.upper[self._movable]
         warm = np.clip(q[self._movable], lower + 1e-4, upper - 1e-4)
@@ -99,9 +144,9 @@ class PinkCore:
         iterations = 0
         for attempt in range(restarts + 1):
             if attempt >= 2 and ranked is None:
-                ranked = self._rank_bank(model, data, order, targets)
+                ranked = self._rank_bank(reduced, targets)
             start = warm if attempt == 0 else self._restart(warm, lower, upper, ranked, attempt)
-            found, used = self._attempt(model, data, order, targets, start, tolerance_m, oriented_first=attempt == 0)
+            found, used = self._attempt(reduced, targets, start, tolerance_m, oriented_first=attempt == 0)
             iterations += used
             error, angle, posture = found
             cost = max(error, 0.0) + 0.002 * angle
@@ -119,10 +164,9 @@ class PinkCore:
     def _arm_of(self, joint: str) -> str:
         return next((arm for arm, spec in self.robot.spec.arms.items() if joint in spec.joints), "")
 
-    def _rank_bank(
-        self, model: pin.Model, data: pin.Data, order: NDArray[np.int64], targets: Mapping[str, ReachTarget]
-    ) -> dict[str, NDArray[np.int64]]:
+    def _rank_bank(self, reduced: _Reduced, targets: Mapping[str, ReachTarget]) -> dict[str, NDArray[np.int64]]:
         """Per targeted arm, the bank's postures from the nearest grasp site to the farthest."""
+        model, data, order = reduced.model, reduced.data, reduced.order
         full = pin.neutral(model)
         frames = {arm: model.getFrameId(self.robot.spec.arms[arm].grasp_site) for arm in targets}
         distance = {arm: np.zeros(len(self._bank)) for arm in targets}
@@ -152,9 +196,7 @@ class PinkCore:
 
     def _attempt(
         self,
-        model: pin.Model,
-        data: pin.Data,
-        order: NDArray[np.int64],
+        reduced: _Reduced,
         targets: Mapping[str, ReachTarget],
         start: Array,
         tolerance_m: float,
@@ -168,12 +210,12 @@ class PinkCore:
         """
         oriented = any(target.rotation is not None for target in targets.values())
         ladder = (1.0,) if not oriented else _RELAXATIONS if oriented_first else _RELAXATIONS[::-1]
-        found, iterations = self._descend(model, data, order, targets, start, tolerance_m, ladder[0])
+        found, iterations = self._descend(reduced, targets, start, tolerance_m, ladder[0])
         for relaxation in ladder[1:]:
             reached = found[0] <= tolerance_m
             if reached == oriented_first:
                 break
-            following, used = self._descend(model, data, order, targets, found[2], tolerance_m, relaxation)
+            following, used = self._descend(reduced, targets, found[2], tolerance_m, relaxation)
             iterations += used
             if not oriented_first and following[0] > tolerance_m:
                 break
@@ -182,17 +224,16 @@ class PinkCore:
 
     def _descend(
         self,
-        model: pin.Model,
-        data: pin.Data,
-        order: NDArray[np.int64],
+        reduced: _Reduced,
         targets: Mapping[str, ReachTarget],
         start: Array,
         tolerance_m: float,
         relaxation: float,
     ) -> tuple[tuple[float, float, Array], int]:
+        model, order = reduced.model, reduced.order
         full = pin.neutral(model)
         full[order] = start
-        configuration = pink.Configuration(model, data, full, copy_data=False)
+        configuration = pink.Configuration(model, reduced.data, full, copy_data=False)
         tasks: list[FrameTask | PostureTask | ComTask] = []
         frame_tasks: list[tuple[FrameTask, ReachTarget]] = []
         for arm, target in targets.items():
@@ -220,14 +261,12 @@ class PinkCore:
             com = ComTask(cost=0.05)
             com.set_target_from_configuration(configuration)
             tasks.append(com)
-        limits = [ConfigurationLimit(model), VelocityLimit(model)]
         previous, error = np.inf, np.inf
         step = 0
         while step < _MAX_ITERATIONS:
             step += 1
-            velocity = pink.solve_ik(
-                configuration, tasks, _DT_S, solver="daqp", damping=1e-8, limits=limits, safety_break=False
-            )
+            problem = pink.build_ik(configuration, tasks, _DT_S, damping=1e-8, limits=[reduced.limits])
+            velocity = _solved(*(np.asarray(part) for part in (problem.P, problem.q, problem.G, problem.h))) / _DT_S
             configuration.integrate_inplace(velocity, _DT_S)
             error = max(float(np.linalg.norm(task.compute_error(configuration)[:3])) for task, _ in frame_tasks)
             if error < 0.1 * tolerance_m or abs(previous - error) < max(_STALL_M, _STALL_FRACTION * error):
@@ -239,3 +278,15 @@ class PinkCore:
                 reached = configuration.get_transform_frame_to_world(task.frame).rotation[:, 0]
                 angle = max(angle, float(np.arccos(np.clip(reached @ np.asarray(target.rotation)[:, 0], -1.0, 1.0))))
         return (error, angle, np.asarray(configuration.q)[order].copy()), step
+
+
+def _solved(hessian: Array, gradient: Array, rows: Array, bounds: Array) -> Array:
+    """(N,) minimum of a convex quadratic program with rows @ x <= bounds.
+
+    The solver is asked directly: the checks and copies around it in `pink.solve_ik` took as long as the solution.
+    """
+    free = np.full(len(bounds), _UNBOUNDED)
+    x, _, flag, _ = daqp.solve(hessian, gradient, rows, bounds, free, np.zeros(len(bounds), dtype=c_int))
+    if flag <= 0:
+        raise ArithmeticError(f"inverse kinematics: the quadratic program has no solution (exit flag {flag})")
+    return x

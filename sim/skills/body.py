@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from typing import Final
 
 import mujoco
@@ -583,7 +583,7 @@ class Body:
             yield
 
 
-@lru_cache(maxsize=8)
+@cache
 def ready_posture(kit: RobotKit, arm: Arm, raised: bool = False) -> Array:
     """See `Body.ready` and `Body.carrying`; solved once per robot and arm."""
     reach_map = reach_maps(kit)[arm.value]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from configs.validate import ConfigError
-from sim.robots.build_solver import robot_kit
+from sim.robots.build_solver import SOLVERS, robot_kit
 from sim.robots.kinematics import root_quaternion
 from sim.robots.reach import reach_over_heights
 from sim.robots.solver import ReachTarget, rotation_from_axes
@@ -175,3 +175,21 @@ def test_one_kit_per_description(tmp_path):
 def test_unknown_robot():
     with pytest.raises(ConfigError, match="allowed: h1, x1"):
         robot_kit("atlas")
+
+
+@pytest.mark.parametrize("name", available_robots())
+def test_a_solution_does_not_depend_on_what_was_solved_before(name):
+    """Also when the earlier height was almost the same: models of heights are kept."""
+    kit = robot_kit(name)
+    height = float(np.mean(kit.spec.pelvis_height_range_m))
+    pose = _random_poses(kit, height, np.random.default_rng(2))["left"]
+
+    def solved(solver, pelvis_height_m):
+        q = kit.crouches.posture(pelvis_height_m)
+        return solver.solve({"left": ReachTarget.from_pose(pose)}, q, pelvis_height_m=pelvis_height_m).q
+
+    alone = solved(SOLVERS[kit.spec.solver](kit.model, kit.crouches), height)
+    used = SOLVERS[kit.spec.solver](kit.model, kit.crouches)
+    nearby = solved(used, height + 2e-7)
+    assert not np.array_equal(nearby, alone)
+    assert np.array_equal(solved(used, height), alone)
