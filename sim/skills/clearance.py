@@ -94,6 +94,7 @@ class ClearanceProbe:
         ignore: Iterable[str | int] = (),
         opening: float | None = None,
         limit_m: float = np.inf,
+        relief: Array | None = None,
     ) -> Array:
         """Deepest penetration of forearm and hand into furniture or objects for each arm posture, other joints as they are.
 
@@ -103,6 +104,7 @@ class ClearanceProbe:
             ignore: ids of objects, or numbers of geoms, that may be touched; whatever is held is ignored too.
             opening: opening of the hand, None as it is.
             limit_m: the rest of the postures is left out after the first one deeper than this.
+            relief: per posture, the share of the first one's depth that does not count towards the limit.
         """
         world, scratch, model = self._world, self._scratch, self._world.model
         allowed = {geom for geom in ignore if isinstance(geom, int)}
@@ -134,7 +136,7 @@ class ClearanceProbe:
             other = np.where(touching[a], b, a)
             counts = (touching[a] != touching[b]) & barred[other]
             depths.append(max(0.0, float(-np.min(scratch.contact.dist[: scratch.ncon][counts], initial=0.0))))
-            if depths[-1] > limit_m:
+            if depths[-1] - (0.0 if relief is None else depths[0] * relief[len(depths) - 1]) > limit_m:
                 break
         return np.array(depths)
 

@@ -93,10 +93,12 @@ def route(
         worst = 0.0
         for number, (a, b) in enumerate(legs):
             shares = np.linspace(0.0, 1.0, 2 + int(np.max(np.abs(b - a)) / _PATH_STEP_RAD))
-            depths = body.probe.depths_m(arm, a + shares[:, None] * (b - a), ignore, opening)
             # an arm that touches something at the start may do so until it has come away from it
-            excess = depths - depths[0] * np.maximum(1.0 - 3.0 * shares, 0.0) if number == 0 else depths
-            worst = max(worst, float(excess.max()))
+            relief = np.maximum(1.0 - 3.0 * shares, 0.0) if number == 0 else np.zeros_like(shares)
+            depths = body.probe.depths_m(arm, a + shares[:, None] * (b - a), ignore, opening, _SLIDE_M, relief)
+            worst = max(worst, float((depths - depths[0] * relief[: len(depths)]).max()))
+            if worst > _SLIDE_M:  # how much more does not matter: this way is not taken
+                break
         if worst <= _GRAZE_M:
             return () if via is None else (via,)
         if best is None or worst < best[0]:
