@@ -26,6 +26,7 @@ from sim.skills.grasps import hand_shape
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
 from sim.skills.reach import Reach, blame, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
+from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.trajectory import min_jerk
 
@@ -83,6 +84,7 @@ def _pointings(body: Body, arm: Arm, point: Array) -> Iterator[Array]:
             yield np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
 
 
+@remembered
 def assess_open_close(body: Body, action: Action) -> Pull:
     """What Open or Close would do.
 
@@ -249,6 +251,7 @@ def _leave(body: Body, arm: Arm, reach: Reach, ignore: tuple[str, ...]) -> Skill
     yield from stow(body, arm, ignore)
 
 
+@remembered
 def assess_toggle(body: Body, action: Action) -> Reach:
     """What ToggleOn or ToggleOff would do.
 

@@ -11,11 +11,12 @@ Frames: `world`; `pelvis` is the pelvis heading frame.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -90,6 +91,14 @@ class BothGoal:
     tilt_rad: float = 0.0
 
 
+@dataclass(slots=True)
+class Plans:
+    """Plans of actions from one state, see `sim.skills.remembered`."""
+
+    state: object = None
+    made: dict[Action, Any] = field(default_factory=dict)
+
+
 class Body:
     """One robot in a world."""
 
@@ -120,7 +129,18 @@ class Body:
         #: Whether a refusal may stay unexplained: no other pelvis heights are tried to find its reason.
         self.hurried = False
         self._vias: dict[Arm, tuple[Array, ...]] = {}
+        self.plans = Plans()
         self.probe = ClearanceProbe(world, self)
+
+    def planning_state(self) -> tuple[object, ...]:
+        """Everything that a plan depends on: positions, commands, states and holders of objects, what is being considered."""
+        data = self.world.data
+        things = tuple(
+            (dataclasses.astuple(thing.state), tuple(thing.held_by), thing.openness, thing.mass_kg)
+            for thing in self.world.objects.values()
+        )
+        numbers = (data.qpos.tobytes(), data.ctrl.tobytes(), data.xpos.tobytes())
+        return *numbers, things, self.considered_height_m, self.hurried
 
     # ---- base and legs
 

@@ -23,6 +23,7 @@ from sim.skills.checks import check_pick, check_place
 from sim.skills.grasps import Grasp, grasp_candidates
 from sim.skills.reach import Reach, blame, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
+from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
 
 __all__ = ["Luck", "pick", "place", "plan_pick", "plan_place", "reset_arm", "stow"]
@@ -287,6 +288,7 @@ def place(body: Body, action: Action, luck: Luck) -> Skill:
         raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})
 
 
+@remembered
 def assess_pick(body: Body, action: Action) -> tuple[Grasp, Reach]:
     """What Pick would do.
 
@@ -299,6 +301,7 @@ def assess_pick(body: Body, action: Action) -> tuple[Grasp, Reach]:
     return plan_pick(body, action.arm, thing)
 
 
+@remembered
 def assess_place(body: Body, action: Action) -> tuple[Array, Reach, Array]:
     """What Place would do.
 

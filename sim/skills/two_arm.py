@@ -22,6 +22,7 @@ from sim.skills.grasps import solid_box
 from sim.skills.manipulate import GRASP_GAP_M, Luck
 from sim.skills.reach import blame, route
 from sim.skills.reach_map import HandPose
+from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
 
 __all__ = ["assess_lift", "assess_place_both", "lift", "place_both"]
@@ -78,6 +79,7 @@ def _goal(body: Body, sides: Mapping[Arm, tuple[Array, Array]], apart_m: float, 
     return body.solve_both(wishes, start)
 
 
+@remembered
 def assess_lift(body: Body, action: Action) -> BothReach:
     """What Lift would do.
 
@@ -185,6 +187,7 @@ def _shifted(body: Body, up_m: float, back_m: float) -> BothGoal:
     return body.solve_both(wishes, body.commanded_both())
 
 
+@remembered
 def assess_place_both(body: Body, action: Action) -> tuple[BothGoal, BothGoal]:
     """What PlaceBoth would do: hands above the spot, and at it.
 

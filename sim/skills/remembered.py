@@ -1,0 +1,29 @@
+"""Plans made once: the expert asks what an action would do, and right afterwards the skill does it from the same state."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TypeVar
+
+from data.records import Action
+from sim.skills.body import Body
+
+__all__ = ["remembered"]
+
+T = TypeVar("T")
+
+
+def remembered(plan: Callable[[Body, Action], T]) -> Callable[[Body, Action], T]:
+    """Lets a planner of an action return its last plan again while nothing that it depends on has changed."""
+
+    @functools.wraps(plan)
+    def wrapped(body: Body, action: Action) -> T:
+        state, kept = body.planning_state(), body.plans
+        if kept.state != state:
+            kept.state, kept.made = state, {}
+        if action not in kept.made:
+            kept.made[action] = plan(body, action)
+        return kept.made[action]
+
+    return wrapped
