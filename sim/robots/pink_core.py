@@ -72,7 +72,7 @@ class _HandTask(FrameTask):
 
     def __init__(self, frame: str, frame_id: int, cost: Array, target: pin.SE3) -> None:
         super().__init__(frame, position_cost=1.0, orientation_cost=0.0, lm_damping=_LM_DAMPING)
-        self.cost = cost
+        self.cost = self._cost = cost
         self.set_target(target)
         self._id, self._goal, self._known = frame_id, target, np.zeros(0)
 
@@ -90,8 +90,8 @@ class _HandTask(FrameTask):
         error = self._known if len(self._known) else self.compute_error(configuration)
         inward = self._goal.actInv(configuration.data.oMf[self._id])
         local = pin.getFrameJacobian(configuration.model, configuration.data, self._id, pin.ReferenceFrame.LOCAL)
-        jacobian = self.cost[:, None] * (-pin.Jlog6(inward) @ local)
-        weighted = self.cost * -error
+        jacobian = self._cost[:, None] * (-pin.Jlog6(inward) @ local)
+        weighted = self._cost * -error
         damping = self.lm_damping * weighted @ weighted
         return jacobian.T @ jacobian + damping * configuration.tangent.eye, -weighted.T @ jacobian
 
@@ -101,14 +101,14 @@ class _RestTask(PostureTask):
 
     def __init__(self, cost: Array, target: Array) -> None:
         super().__init__(cost=_POSTURE_COST)
-        self.cost = cost
+        self.cost = self._cost = cost
         self.set_target(target)
         self._target, self._hessian = target.copy(), np.diag(cost * cost)
 
     def compute_qp_objective(self, configuration: pink.Configuration) -> tuple[Array, Array]:
         """See `pink.tasks.Task`."""
-        weighted = self.cost * -pin.difference(configuration.model, self._target, configuration.q)
-        return self._hessian, -(weighted * self.cost)
+        weighted = self._cost * -pin.difference(configuration.model, self._target, configuration.q)
+        return self._hessian, -(weighted * self._cost)
 
 
 @dataclass(frozen=True, slots=True)
