@@ -3,7 +3,8 @@
 Each iteration solves Pink's quadratic program: minimise the weighted task errors subject to joint position and velocity limits,
     min_v  sum_i || J_i v dt + alpha e_i ||^2_{W_i} + lambda || v ||^2    s.t.  q_min <= q + v dt <= q_max,  |v| <= v_max
 with frame tasks for the grasp sites, a posture task that keeps redundant joints near their start, and, for whole-body solves, a
-centre-of-mass task. Legs and lean are those of the crouch at the given pelvis height.
+centre-of-mass task. Legs and lean are those of the crouch at the given pelvis height. Thousands of solves precede a grasp, so
+tasks and limits are Pink's classes with what is constant kept, and DAQP is called directly.
 """
 
 from __future__ import annotations
@@ -68,30 +69,29 @@ class _JointLimits(Limit):
 
 
 class _HandTask(FrameTask):
-    """Pink's frame task with its frame looked up once and each error computed once: the same numbers, faster."""
+    """Pink's frame task with its frame looked up once and its error computed once per configuration: the same numbers."""
 
     def __init__(self, frame: str, frame_id: int, cost: Array, target: pin.SE3) -> None:
         super().__init__(frame, position_cost=1.0, orientation_cost=0.0, lm_damping=_LM_DAMPING)
         self.cost = self._cost = cost
         self.set_target(target)
-        self._id, self._goal, self._known = frame_id, target, np.zeros(0)
-
-    def reached(self, configuration: pink.Configuration) -> float:
-        """Distance (m) of the frame from its target; the error stays known until the configuration changes."""
-        self._known = self.compute_error(configuration)
-        return float(np.linalg.norm(self._known[:3]))
+        self._id, self._goal = frame_id, target
+        self._at: Array | None = None
+        self._error: Array = np.zeros(6)
 
     def compute_error(self, configuration: pink.Configuration) -> Array:
-        """See `pink.tasks.FrameTask`."""
-        return pin.log(configuration.data.oMf[self._id].actInv(self._goal)).vector
+        """See `pink.tasks.FrameTask`. A configuration that moves on has another array of positions."""
+        if self._at is not configuration.q:
+            self._at = configuration.q
+            self._error = pin.log(configuration.data.oMf[self._id].actInv(self._goal)).vector
+        return self._error
 
     def compute_qp_objective(self, configuration: pink.Configuration) -> tuple[Array, Array]:
         """See `pink.tasks.Task`."""
-        error = self._known if len(self._known) else self.compute_error(configuration)
         inward = self._goal.actInv(configuration.data.oMf[self._id])
         local = pin.getFrameJacobian(configuration.model, configuration.data, self._id, pin.ReferenceFrame.LOCAL)
         jacobian = self._cost[:, None] * (-pin.Jlog6(inward) @ local)
-        weighted = self._cost * -error
+        weighted = self._cost * -self.compute_error(configuration)
         damping = self.lm_damping * weighted @ weighted
         return jacobian.T @ jacobian + damping * configuration.tangent.eye, -weighted.T @ jacobian
 
@@ -307,7 +307,7 @@ class PinkCore:
             problem = pink.build_ik(configuration, tasks, _DT_S, damping=1e-8, limits=[reduced.limits])
             velocity = _solved(*(np.asarray(part) for part in (problem.P, problem.q, problem.G, problem.h))) / _DT_S
             configuration.integrate_inplace(velocity, _DT_S)
-            error = max(task.reached(configuration) for task, _ in hands)
+            error = max(float(np.linalg.norm(task.compute_error(configuration)[:3])) for task, _ in hands)
             if error < 0.1 * tolerance_m or abs(previous - error) < max(_STALL_M, _STALL_FRACTION * error):
                 break
             previous = error

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from data.records import Arm, FailureCategory, PlanStep
+from data.records import Action, Arm, FailureCategory, PlanStep
 from sim.failures import FailureCode, SkillFailure
 from sim.objects import ObjectPlacement
 from sim.session import FreePlay, Session
 from sim.skills.body import Body
+from sim.skills.remembered import remembered
 from sim.skills.runner import refuse, run_skills
 from sim.world import World
 
@@ -184,3 +185,26 @@ def test_refuse_and_runaway_skills():
 def test_a_world_without_robot_is_refused():
     with pytest.raises(ValueError, match="need a world with a robot"):
         Body(World(None, "kitchen_1", settle_s=0.0))
+
+
+def test_a_plan_is_made_once_until_something_changes(session):
+    """Commands, states and the height that is considered decide about a plan; asked again from one state it is the same."""
+    start(session)
+    made = []
+
+    @remembered
+    def plan(body, action):
+        made.append(action)
+        return object()
+
+    body, action = session.body, Action("ResetArm", arm=Arm.LEFT)
+    first = plan(body, action)
+    assert plan(body, action) is first and len(made) == 1
+    assert plan(body, Action("ResetArm", arm=Arm.RIGHT)) is not first
+    session.world.set_state("Mug_1", "isDirty", True)
+    second = plan(body, action)
+    assert second is not first
+    body.command_hand(Arm.LEFT, 0.5)
+    assert plan(body, action) is not second
+    with body.considering(0.8):
+        assert plan(body, action) is not second
