@@ -17,6 +17,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from configs.assets import own_files
 from configs.validate import ConfigError
 
 __all__ = ["CONFIG_DIR", "compose", "groups"]
@@ -51,6 +52,7 @@ def compose(root: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
         allowed = ", ".join(sorted(path.stem for path in CONFIG_DIR.glob("*.yaml")))
         raise ConfigError(f"no root config {root!r}; allowed: {allowed}")
     _check_groups(overrides)
+    overrides = _name_own_robots(overrides)
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(config_dir=str(CONFIG_DIR), version_base=None):
@@ -63,8 +65,22 @@ def compose(root: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
     return {str(key): value for key, value in values.items()}
 
 
+def _name_own_robots(overrides: Sequence[str]) -> list[str]:
+    """Spells `robot=NAME` out for a robot of the user's own assets, which has no file in `configs/robot`."""
+    own = own_files("robots")
+    spelled: list[str] = []
+    for override in overrides:
+        key, _, value = override.partition("=")
+        if key.lstrip("+") == "robot" and value in own:
+            spelled += [f"robot={groups()['robot'][0]}", f"robot.name={value}", f"robot.spec='{own[value]}'"]
+        else:
+            spelled.append(override)
+    return spelled
+
+
 def _check_groups(overrides: Sequence[str]) -> None:
     known = groups()
+    known["robot"] = (*known["robot"], *own_files("robots"))
     for override in overrides:
         key, sep, value = override.partition("=")
         if not sep and not key.startswith("~"):

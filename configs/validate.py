@@ -26,7 +26,7 @@ def build(cls: type[T], values: Mapping[str, Any], where: str = "") -> T:
     """Builds the frozen dataclass `cls` from a mapping.
 
     Args:
-        cls: a dataclass; nested dataclasses, enums, Literal, tuples, Optional and plain scalars are understood.
+        cls: a dataclass; nested dataclasses, enums, Literal, tuples, frozensets, Optional and plain scalars are understood.
         values: plain mapping with string keys.
         where: dotted path of this mapping in the whole configuration, for messages.
 
@@ -92,6 +92,10 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         if len(items) != len(args):
             raise ConfigError(f"{where}: expected {len(args)} entries, got {value!r}")
         return tuple(_convert(arg, item, f"{where}[{i}]") for i, (arg, item) in enumerate(zip(args, items, strict=True)))
+    if origin is frozenset:
+        if isinstance(value, str) or not hasattr(value, "__iter__"):
+            raise ConfigError(f"{where}: expected a list, got {value!r}")
+        return frozenset(_convert(get_args(hint)[0], item, where) for item in value)
     if origin in (dict, Mapping) or getattr(origin, "__name__", "") == "Mapping":
         if not isinstance(value, Mapping):
             raise ConfigError(f"{where}: expected a mapping, got {value!r}")

@@ -20,6 +20,7 @@ from typing import Final
 import yaml
 
 import configs
+from configs.assets import asset_files
 from configs.validate import build
 from data.records import ACTIONS
 
@@ -82,16 +83,15 @@ class ContingencyConfig:
 
 
 def load_contingency(name: str = "default") -> ContingencyConfig:
-    """Reads `configs/contingency/<name>.yaml`.
+    """Reads `configs/contingency/<name>.yaml`, or that of one's own assets (`configs.assets`).
 
     Raises:
         ValueError: when there is no such file.
     """
-    folder = Path(configs.__file__).parent / "contingency"
-    path = folder / f"{name}.yaml"
-    if not path.is_file():
-        raise ValueError(f"no contingency config {name!r}; allowed: {sorted(p.stem for p in folder.glob('*.yaml'))}")
-    return build(ContingencyConfig, yaml.safe_load(path.read_text(encoding="utf-8")))
+    files = asset_files("contingency", Path(configs.__file__).parent / "contingency")
+    if name not in files:
+        raise ValueError(f"no contingency config {name!r}; allowed: {', '.join(sorted(files))}")
+    return build(ContingencyConfig, yaml.safe_load(files[name].read_text(encoding="utf-8")), files[name].name)
 
 
 def _uniform(seed: int, step: int, action: str, object_id: str) -> float:

@@ -1,6 +1,7 @@
 """The catalogue of object types: what exists, how big and heavy it is, what can be done with it, and what it is built from.
 
-Types are data (`object_types.yaml`): a shape is a list of primitives, so a new type needs no code. Paper: the DualTHOR asset
+Types are data (`object_types.yaml`, and `types/` of one's own assets, see `configs.assets`): a shape is a list of primitives, so a
+new type needs no code. Paper: the DualTHOR asset
 set; dimensions, masses and properties follow AI2-THOR's, the meshes are replaced by primitives.
 """
 
@@ -14,7 +15,8 @@ from typing import Any, Final, Literal
 
 import yaml
 
-from configs.validate import build
+from configs.assets import own_files
+from configs.validate import ConfigError, build
 
 __all__ = [
     "CATALOGUE_PATH",
@@ -226,7 +228,7 @@ class ObjectType:
         return "fillable" in self.properties
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Catalogue:
     """All types and the colours they use.
 
@@ -256,40 +258,66 @@ class Catalogue:
         return list(self.types).index(name)
 
 
-@functools.lru_cache(maxsize=4)
 def load_catalogue(path: Path = CATALOGUE_PATH) -> Catalogue:
-    """Reads and validates the catalogue.
+    """Reads and validates a catalogue; the user's types come after those of the file.
 
     Raises:
-        ValueError: on an unknown version, colour, shape, option or property.
+        ValueError: on an unknown version, colour, shape, option or property, or a type or colour that exists twice.
     """
-    raw = yaml.safe_load(path.read_text(encoding="utf-8"))
-    if raw.get("version") != _VERSION:
-        raise ValueError(f"{path.name}: version {raw.get('version')!r} is not supported; expected {_VERSION}")
+    return _read((path, *own_files("types").values()))
+
+
+@functools.lru_cache(maxsize=8)
+def _read(paths: tuple[Path, ...]) -> Catalogue:
     colors: dict[str, tuple[float, float, float, float]] = {}
-    for name, value in raw["colors"].items():
-        r, g, b, a = (*map(float, value), 1.0)[:4]
-        colors[name] = (r, g, b, a)
     types: dict[str, ObjectType] = {}
-    for name, entry in raw["types"].items():
-        entry = dict(entry)
-        entry["name"] = name
-        entry["properties"] = frozenset(entry["properties"])
-        entry["parts"] = _parts(entry["parts"], f"{name}.parts")
-        entry["moving"] = tuple(
-            build(MovingSpec, {**moving, "parts": _parts(moving["parts"], f"{name}.{moving['name']}")}, f"{name}.moving")
-            for moving in entry.get("moving", ())
+    for path in paths:
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if not isinstance(raw, dict) or raw.get("version") != _VERSION:
+            version = raw.get("version") if isinstance(raw, dict) else None
+            raise ConfigError(f"{path.name}: version {version!r} is not supported; expected {_VERSION}")
+        for name, value in raw.get("colors", {}).items():
+            if name in colors:
+                raise ConfigError(f"{path.name}: colour {name!r} exists already")
+            if not 3 <= len(value) <= 4 or not all(isinstance(v, int | float) and 0 <= v <= 1 for v in value):
+                raise ConfigError(f"{path.name}: colour {name!r} must be three or four numbers in [0, 1], got {value!r}")
+            r, g, b, a = (*map(float, value), 1.0)[:4]
+            colors[name] = (r, g, b, a)
+        for name, entry in raw.get("types", {}).items():
+            if name in types:
+                raise ConfigError(f"{path.name}: type {name!r} exists already")
+            types[name] = kind = _type(name, entry, path.name)
+            for part in (*kind.parts, *(part for moving in kind.moving for part in moving.parts)):
+                if part.color not in colors:
+                    raise ConfigError(f"{path.name}: {name}: unknown colour {part.color!r}; allowed: {', '.join(colors)}")
+    return Catalogue(_VERSION, colors, types)
+
+
+def _type(name: str, entry: Any, file: str) -> ObjectType:
+    """Builds one type from its entry of a file."""
+    where = f"{file}: {name}"
+    if not isinstance(entry, dict):
+        raise ConfigError(f"{where}: expected a mapping, got {entry!r}")
+    values: dict[str, Any] = {**entry, "name": name, "parts": _parts(entry.get("parts"), f"{where}.parts")}
+    properties = entry.get("properties", ())
+    unknown = [word for word in properties if word not in PROPERTIES]
+    if unknown:
+        raise ConfigError(f"{where}: unknown property {unknown[0]!r}; allowed: {', '.join(PROPERTIES)}")
+    values["properties"] = properties
+    values["moving"] = tuple(
+        build(
+            MovingSpec,
+            {**moving, "parts": _parts(moving.get("parts"), f"{where}.moving.{moving.get('name')}")},
+            f"{where}.moving",
         )
-        entry["grips"] = {key: tuple(tuple(point) for point in points) for key, points in entry.get("grips", {}).items()}
-        entry["surfaces"] = tuple(build(SurfaceSpec, surface, f"{name}.surfaces") for surface in entry.get("surfaces", ()))
-        entry["size"] = tuple(entry["size"])
-        entry["rooms"] = tuple(entry["rooms"])
-        types[name] = ObjectType(**entry)
-        for part in (*types[name].parts, *(part for moving in types[name].moving for part in moving.parts)):
-            if part.color not in colors:
-                raise ValueError(f"{name}: unknown colour {part.color!r}; allowed: {', '.join(colors)}")
-    return Catalogue(raw["version"], colors, types)
+        for moving in entry.get("moving", ())
+    )
+    values["grips"] = {key: tuple(tuple(point) for point in points) for key, points in entry.get("grips", {}).items()}
+    values["surfaces"] = tuple(build(SurfaceSpec, surface, f"{where}.surfaces") for surface in entry.get("surfaces", ()))
+    return build(ObjectType, values, where)
 
 
 def _parts(rows: Any, where: str) -> tuple[Part, ...]:
+    if not isinstance(rows, list) or not rows:
+        raise ConfigError(f"{where}: expected a list of parts, got {rows!r}")
     return tuple(Part.parse(row, where) for row in rows)

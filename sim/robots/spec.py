@@ -1,6 +1,7 @@
 """What the project knows of a robot beyond its MJCF: its arms, legs and hands, where the key bodies are, its limits.
 
-A robot is one YAML file (`specs/<name>.yaml`) and one MJCF; `load_robot` validates the file against the MJCF.
+A robot is one YAML file (`specs/<name>.yaml`, or `robots/<name>.yaml` of one's own assets, see `configs.assets`) and one MJCF;
+`load_robot` validates the file against the MJCF.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from typing import Literal
 
 import yaml
 
+from configs.assets import asset_files
 from configs.validate import ConfigError, build
 
-__all__ = ["KEY_BODIES", "SIDES", "ArmSpec", "FootSpec", "RobotSpec", "available_robots", "load_robot"]
+__all__ = ["KEY_BODIES", "SIDES", "ArmSpec", "FootSpec", "HandSpec", "RobotSpec", "available_robots", "load_robot"]
 
 SIDES = ("left", "right")
 #: Bodies whose positions make up a motion frame, in this order, shared by all robots (and matched to SMPL joints in `data`).
@@ -75,6 +77,36 @@ class FootSpec:
 
 
 @dataclass(frozen=True, slots=True)
+class HandSpec:
+    """Size of an open hand around its grasp site (x along the fingers, y the closing direction), for planning grasps.
+
+    Attributes:
+        behind_m: free distance from the site to what closes from behind (site -y): the palm, or one finger.
+        max_radius_m: half the width of the widest object that fits between the fingers.
+        tip_m: how far the open fingers reach beyond the site.
+        half_width_m: half the hand's width across (site z).
+        slope: how the thumb limits the seat: free x per metre of radius, and at radius 0; (0, 0) for parallel fingers.
+        pinch_m: distance along y at which half-closed fingertips and thumb meet a surface; None when the fingers are parallel.
+        clearance_m: free distance between the object and what closes from behind, on arrival.
+        press: the fingertip that presses a switch: x and y in the site's frame, and the opening of the hand for it.
+    """
+
+    behind_m: float
+    max_radius_m: float
+    tip_m: float
+    half_width_m: float
+    slope: tuple[float, float] = (0.0, 0.0)
+    pinch_m: float | None = None
+    clearance_m: float = 0.0
+    press: tuple[float, float, float] = (0.036, 0.0, 0.0)
+
+    def seat(self, radius_m: float) -> tuple[float, float]:
+        """Where the middle of an object of that half width belongs: x and y in the site's frame."""
+        forward = self.slope[0] * radius_m + self.slope[1]
+        return (max(forward, 0.0), max(radius_m + self.clearance_m - self.behind_m, 0.0))
+
+
+@dataclass(frozen=True, slots=True)
 class RobotSpec:
     """A dual-arm humanoid.
 
@@ -90,6 +122,7 @@ class RobotSpec:
         standing_pelvis_height_m: pelvis above the floor when standing.
         pelvis_height_range_m: lowest and highest pelvis with flat soles and a balanced centre of mass.
         foot: sole size.
+        hand: size of both hands.
         footprint_radius_m: radius of the disc that navigation keeps free.
         two_arm_max_load_kg: heaviest object both arms carry.
         max_joint_velocity: rad/s for trajectories and inverse kinematics.
@@ -108,6 +141,7 @@ class RobotSpec:
     standing_pelvis_height_m: float
     pelvis_height_range_m: tuple[float, float]
     foot: FootSpec
+    hand: HandSpec
     footprint_radius_m: float
     two_arm_max_load_kg: float
     max_joint_velocity: float
@@ -127,24 +161,29 @@ class RobotSpec:
 
 
 def available_robots() -> tuple[str, ...]:
-    """Names of the built-in robots."""
-    return tuple(sorted(path.stem for path in _SPECS.glob("*.yaml")))
+    """Names of the robots, the user's included."""
+    return tuple(sorted(asset_files("robots", _SPECS)))
 
 
-@lru_cache(maxsize=16)
 def load_robot(name: str, mjcf: str | None = None) -> RobotSpec:
     """Loads a robot.
 
     Args:
-        name: name of a built-in robot, or path of a YAML file of the same format.
+        name: name of a robot, or path of a YAML file of the same format.
         mjcf: path of an MJCF file that replaces the description's own, for example one with the vendor's meshes.
 
     Raises:
         ConfigError: on an unknown name, a bad file, or a joint that the MJCF does not have.
     """
-    path = Path(name) if name.endswith((".yaml", ".yml")) else _SPECS / f"{name}.yaml"
+    files = asset_files("robots", _SPECS)
+    path = Path(name) if name.endswith((".yaml", ".yml")) else files.get(name, Path())
     if not path.is_file():
-        raise ConfigError(f"robot {name!r}: no such robot; allowed: {', '.join(available_robots())}, or a path to a YAML file")
+        raise ConfigError(f"robot {name!r}: no such robot; allowed: {', '.join(sorted(files))}, or a path to a YAML file")
+    return _read(path, mjcf)
+
+
+@lru_cache(maxsize=16)
+def _read(path: Path, mjcf: str | None) -> RobotSpec:
     values = yaml.safe_load(path.read_text(encoding="utf-8"))
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected a mapping")

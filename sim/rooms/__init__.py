@@ -1,6 +1,6 @@
 """Rooms as data: floor, walls, furniture poses, wiring, and the objects that lie around by default.
 
-One YAML file per room in this folder. World frame: x and y in metres on the floor, z up, origin at the centre of the floor.
+One YAML file per room in this folder, or in `rooms/` of one's own assets (`configs.assets`). World frame: x and y in metres on the floor, z up, origin at the centre of the floor.
 Paper: the DualTHOR scenes (kitchen, living room, bedroom, bathroom).
 """
 
@@ -11,12 +11,13 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import yaml
 
-from configs.validate import build
-from sim.catalogue import Part, load_catalogue
+from configs.assets import asset_files
+from configs.validate import ConfigError, build
+from sim.catalogue import Catalogue, Part, load_catalogue
 
 __all__ = ["ROOMS_PATH", "DefaultObject", "Furniture", "Room", "load_room", "room_names"]
 
@@ -102,21 +103,29 @@ class Room:
 
 
 def room_names() -> tuple[str, ...]:
-    """Names of all rooms."""
-    return tuple(sorted(path.stem for path in ROOMS_PATH.glob("*.yaml")))
+    """Names of all rooms, the user's included."""
+    return tuple(sorted(asset_files("rooms", ROOMS_PATH)))
 
 
-@functools.lru_cache(maxsize=32)
 def load_room(name: str) -> Room:
     """Reads and validates a room.
 
     Raises:
         ValueError: on an unknown name or an entry that is not allowed.
     """
-    path = ROOMS_PATH / f"{name}.yaml"
-    if name not in room_names():
-        raise ValueError(f"unknown room {name!r}; allowed: {', '.join(room_names())}")
-    raw: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
+    files = asset_files("rooms", ROOMS_PATH)
+    if name not in files:
+        raise ValueError(f"unknown room {name!r}; allowed: {', '.join(sorted(files))}")
+    return _read(files[name], load_catalogue())
+
+
+@functools.lru_cache(maxsize=32)
+def _read(path: Path, catalogue: Catalogue) -> Room:
+    """Reads one file; `catalogue` is part of the key, because the ids are checked against it."""
+    name = path.stem
+    raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if not isinstance(raw, dict):
+        raise ConfigError(f"{path}: expected a mapping")
     decor = tuple(Part.parse(row, f"{name}.decor") for row in raw.pop("decor", ()))
     room = build(Room, {**raw, "name": name, "decor": ()}, name)
     return Room(**{**{key: getattr(room, key) for key in Room.__dataclass_fields__}, "decor": decor})

@@ -22,7 +22,6 @@ from sim.navigation import Stance
 from sim.objects import MovingPart
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
-from sim.skills.grasps import hand_shape
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
 from sim.skills.reach import Reach, blame, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
@@ -99,7 +98,7 @@ def assess_open_close(body: Body, action: Action) -> Pull:
     low, high = part.range
     goal = low + (_OPEN_TO if opening else -0.04) * (high - low)  # shut means pushed against the stop
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
-    grip_m = hand_shape(body.spec.name).tip_m - 0.025  # the fingertips reach a little past the bar
+    grip_m = body.spec.hand.tip_m - 0.025  # the fingertips reach a little past the bar
 
     def search() -> Pull:
         best: Pull | None = None
@@ -262,7 +261,7 @@ def assess_toggle(body: Body, action: Action) -> Reach:
     arm, thing = action.arm, body.thing(action.object_id)
     check_toggle(body, arm, thing, action.name == "ToggleOn")
     switch = body.world.toggle_point(thing.object_id)
-    ahead, aside, opening = hand_shape(body.spec.name).press
+    ahead, aside, opening = body.spec.hand.press
 
     def search() -> Reach:
         for pointing in _pointings(body, arm, switch):
@@ -295,7 +294,7 @@ def toggle(body: Body, action: Action, luck: Luck) -> Skill:
     arm = action.arm
     assert arm is not None and action.object_id is not None
     thing = body.thing(action.object_id)
-    yield from body.move_hand(arm, hand_shape(body.spec.name).press[2], 0.2)
+    yield from body.move_hand(arm, body.spec.hand.press[2], 0.2)
     yield from body.move_arm(arm, [*reach.way, reach.before])
     yield from body.move_arm(arm, [reach.at], speed=0.7)
     yield from wait(0.1)

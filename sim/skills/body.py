@@ -31,7 +31,6 @@ from sim.robots.build_solver import RobotKit, robot_kit
 from sim.robots.solver import ReachTarget
 from sim.scene import BASE_JOINTS
 from sim.skills.clearance import ClearanceProbe
-from sim.skills.hands import hand_shape
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach_map import WOUND_RAD, HandPose, ReachMap, reach_maps
 from sim.skills.runner import CONTROL_DT_S, Skill
@@ -572,7 +571,7 @@ class Body:
 
     def palm_m(self) -> float:
         """Distance between the grasp site and the part of the hand that presses on a side."""
-        return hand_shape(self.spec.name).behind_m
+        return self.spec.hand.behind_m
 
     def hand_target(self, arm: Arm) -> Array:
         """Commanded hand joints."""
@@ -619,7 +618,7 @@ def ready_posture(kit: RobotKit, arm: Arm, raised: bool = False) -> Array:
     rotation = wish.rotation(wish.pointing, inward) if wish.pointing is not None else np.eye(3)
     height = kit.spec.standing_pelvis_height_m
     elbow = kit.spec.key_bodies[f"{arm.value}_elbow"]
-    tip_m = hand_shape(kit.spec.name).tip_m
+    tip_m = kit.spec.hand.tip_m
     best: tuple[float, Array] | None = None
     for start in reach_map.starts(wish, 60, radius_m=0.15, near=np.array(kit.spec.arms[arm.value].carry)):
         q = kit.model.posture()

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from data.records import Arm
 from sim.objects import ObjectInstance
+from sim.robots.spec import HandSpec
 from sim.skills.body import Body
-from sim.skills.hands import HandShape, hand_shape
 from sim.skills.reach_map import HandPose
 
 __all__ = ["Grasp", "grasp_candidates", "solid_box"]
@@ -108,7 +108,7 @@ def solid_box(thing: ObjectInstance) -> tuple[Array, Array]:
 
 def grasp_candidates(body: Body, arm: Arm, thing: ObjectInstance) -> Iterator[Grasp]:
     """Grasps of an object, most promising first; whether the arm can do them is for the caller to find out."""
-    hand = hand_shape(body.spec.name)
+    hand = body.spec.hand
     shape = _shape(body, thing)
     shoulder = body.shoulder(arm)
     yield from _wraps(thing, shape, hand, shoulder)
@@ -116,7 +116,7 @@ def grasp_candidates(body: Body, arm: Arm, thing: ObjectInstance) -> Iterator[Gr
     yield from _tops(shape, hand, shoulder)
 
 
-def _wraps(thing: ObjectInstance, shape: _Shape, hand: HandShape, shoulder: Array) -> Iterator[Grasp]:
+def _wraps(thing: ObjectInstance, shape: _Shape, hand: HandSpec, shoulder: Array) -> Iterator[Grasp]:
     """Fingers on both sides: from the side when the object is tall, from above when it is low."""
     tall = shape.top - shape.bottom > 0.09
     elevations = (-35.0, -15.0, -55.0, 0.0, -75.0) if tall else (-60.0, -80.0, -40.0, -25.0)
@@ -147,7 +147,7 @@ def _wraps(thing: ObjectInstance, shape: _Shape, hand: HandShape, shoulder: Arra
                 yield Grasp("wrap", middle, seat, pointing, sign * closing)
 
 
-def _rims(thing: ObjectInstance, shape: _Shape, hand: HandShape, shoulder: Array) -> Iterator[Grasp]:
+def _rims(thing: ObjectInstance, shape: _Shape, hand: HandSpec, shoulder: Array) -> Iterator[Grasp]:
     """Fingers on both sides of the wall of a wide vessel, from above."""
     hollow = any(part.wall_m > 0.0 for part in thing.type.parts)
     if not hollow or shape.has_grip or float(np.max(shape.half[:2])) < 0.05 or shape.top - shape.bottom < 0.04:
@@ -166,7 +166,7 @@ def _rims(thing: ObjectInstance, shape: _Shape, hand: HandShape, shoulder: Array
                 yield Grasp("rim", tip, seat, pointing, sign * radial)
 
 
-def _tops(shape: _Shape, hand: HandShape, shoulder: Array) -> Iterator[Grasp]:
+def _tops(shape: _Shape, hand: HandSpec, shoulder: Array) -> Iterator[Grasp]:
     """Fingertips on the upper side: from above with parallel fingers, palm down and half closed with a five-finger hand."""
     top = np.array([shape.grip[0], shape.grip[1], shape.top if not shape.has_grip else min(shape.top, shape.grip[2] + 0.02)])
     if hand.pinch_m is None:
