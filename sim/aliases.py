@@ -10,9 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+import numpy as np
+
 from data.records import ACTIONS, Action, ActionKind, Arm
 
-__all__ = ["ALIASES", "ARGUMENTS", "to_action"]
+__all__ = ["ALIASES", "ARGUMENTS", "number", "to_action"]
 
 #: Foreign names (lower case) of actions of the grammar.
 ALIASES: Final[Mapping[str, str]] = {
@@ -53,6 +55,23 @@ _MAGNITUDE_UNIT: Final[Mapping[str, float]] = {
 }
 
 
+def number(action: str, key: str, value: Any) -> float:
+    """A finite number of a call.
+
+    Raises:
+        ValueError: on anything else, naming the action, the argument and the value.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise ValueError(f"{action}: {key} must be a number, got {str(value)[:80]!r}")
+    try:
+        found = float(value)
+    except OverflowError:
+        found = float("inf")
+    if not np.isfinite(found):
+        raise ValueError(f"{action}: {key} must be a finite number, got {str(value)[:80]}")
+    return found
+
+
 def to_action(name: str, arguments: Mapping[str, Any]) -> Action:
     """Translates one call into an action of the grammar.
 
@@ -66,7 +85,7 @@ def to_action(name: str, arguments: Mapping[str, Any]) -> Action:
     target = ALIASES.get(name.lower())
     if target is None:
         raise ValueError(f"unknown action {name!r}; allowed: {', '.join(sorted(set(ALIASES)))}")
-    unknown = sorted(set(arguments) - set(ARGUMENTS))
+    unknown = sorted(map(str, set(arguments) - set(ARGUMENTS)))
     if unknown:
         raise ValueError(f"{name}: unknown arguments {unknown}; allowed: {', '.join(ARGUMENTS)}")
     spec = ACTIONS[target]
@@ -84,9 +103,9 @@ def to_action(name: str, arguments: Mapping[str, Any]) -> Action:
     amount: float | None = None
     if spec.amount_unit is not None:
         if "magnitude" in arguments:
-            amount = float(arguments["magnitude"]) * _MAGNITUDE_UNIT.get(target, 1.0)
+            amount = number(name, "magnitude", arguments["magnitude"]) * _MAGNITUDE_UNIT.get(target, 1.0)
         for key in ("moveMagnitude", "degrees", "amount"):
             if key in arguments:
-                amount = float(arguments[key])
-    bearing = float(arguments["bearing"]) if target == "GoTo" and "bearing" in arguments else None
+                amount = number(name, key, arguments[key])
+    bearing = number(name, "bearing", arguments["bearing"]) if target == "GoTo" and "bearing" in arguments else None
     return Action(target, arm=arm, object_id=object_id, amount=amount, bearing_deg=bearing)

@@ -2,15 +2,18 @@
 
 The same session, physics and failure codes as everywhere else, behind the interface that users of AI2-THOR and DualTHOR know.
 Action names of both are understood (`sim.aliases`), DualTHOR's `{"actions": [a, b], "executionMode": "parallel"}` included. A
-failed action returns an event with `lastActionSuccess` False and an `errorCode`; an unknown action or argument raises
-ValueError.
+failed action returns an event with `lastActionSuccess` False, an `errorCode` of AI2-THOR where it has one, and our `failureCode`;
+an unknown action or argument raises ValueError and changes nothing. Scripts written for DualTHOR's own Controller use
+`sim.dualthor`.
 
 Episode control that is not part of the planner's grammar lives here: Undo, Redo, SaveState, LoadState, Reset,
-GetReachablePositions and the privileged TP (teleport), which needs `privileged=True`.
+GetReachablePositions, and with `privileged=True` what looks at the state or changes it by hand: TP (teleport),
+GetInteractablePoses, SetObjectPoses, InitialRandomSpawn.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -19,10 +22,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Action, ActionOutcome, PlanStep
-from sim.aliases import to_action
+from sim.aliases import number, to_action
+from sim.failures import FailureCode
+from sim.poses import interactable_poses, random_placements, set_object_poses
+from sim.rooms import load_room
 from sim.session import FreePlay, Session, SessionSnapshot, TaskLike
 
-__all__ = ["Controller", "Event"]
+__all__ = ["THOR_CODES", "Controller", "Event"]
+
+#: AI2-THOR's error code for ours; a code that is not here has no counterpart and is reported as it is.
+THOR_CODES: Final[Mapping[str, str]] = {
+    FailureCode.OBJECT_NOT_KNOWN: "ObjectNotVisible",
+    FailureCode.HAND_OCCUPIED: "InventoryFull",
+    FailureCode.BOTH_HANDS_BUSY: "InventoryFull",
+    FailureCode.HAND_EMPTY: "ObjectNotInInventory",
+    FailureCode.NOT_PICKUPABLE: "ObjectNotPickupable",
+    FailureCode.NOT_LIFTABLE: "ObjectNotPickupable",
+    FailureCode.NEEDS_TWO_HANDS: "ObjectNotPickupable",
+    FailureCode.TOO_HEAVY: "ObjectNotPickupable",
+    FailureCode.NOT_RECEPTACLE: "ObjectNotAllowedInReceptacle",
+    FailureCode.RECEPTACLE_CLOSED: "ReceptacleNotOpen",
+    FailureCode.RECEPTACLE_FULL: "ReceptacleFull",
+}
+#: Actions that need `privileged=True`.
+_PRIVILEGED: Final = ("TP", "GetInteractablePoses", "SetObjectPoses", "InitialRandomSpawn")
+_MAX_POSES: Final = 1000
 
 #: Arguments of each control action.
 _CONTROL: Final[Mapping[str, tuple[str, ...]]] = {
@@ -32,6 +56,9 @@ _CONTROL: Final[Mapping[str, tuple[str, ...]]] = {
     "LoadState": ("name",),
     "Reset": ("scene", "seed"),
     "GetReachablePositions": (),
+    "GetInteractablePoses": ("objectId", "maxPoses"),
+    "SetObjectPoses": ("objectPoses",),
+    "InitialRandomSpawn": ("randomSeed", "excludedReceptacles", "excludedObjectIds"),
     "TP": ("x", "y", "position", "rotation"),
     "Pass": (),
 }
@@ -82,8 +109,9 @@ class Controller:
         difficulty: easy, medium, hard or natural.
         seed: key of the trial's luck.
         third_party_cameras: names of `sim.rendering.CAMERAS` drawn with every event.
-        privileged: allows TP.
+        privileged: allows TP, GetInteractablePoses, SetObjectPoses and InitialRandomSpawn.
         task: start from a task instead of the room's default.
+        undo_limit: how many steps Undo goes back; each takes about a megabyte.
 
     Attributes:
         session: what is driven.
@@ -104,6 +132,7 @@ class Controller:
         third_party_cameras: Sequence[str] = (),
         privileged: bool = False,
         task: TaskLike | None = None,
+        undo_limit: int = 100,
     ) -> None:
         if width != height:
             raise ValueError(f"frames are square, got width {width} and height {height}")
@@ -111,20 +140,30 @@ class Controller:
         self._size, self._seed = width, seed
         self._cameras, self._privileged = tuple(third_party_cameras), privileged
         self._task: TaskLike = FreePlay(scene) if task is None else task
-        self._undo: list[SessionSnapshot] = []
-        self._redo: list[SessionSnapshot] = []
+        self._undo: deque[SessionSnapshot] = deque(maxlen=undo_limit)
+        self._redo: deque[SessionSnapshot] = deque(maxlen=undo_limit)
         self._saved: dict[str, SessionSnapshot] = {}
         self.last_event = self.reset()
 
     def reset(self, scene: str | None = None, seed: int | None = None) -> Event:
-        """Starts the room, or another one, anew."""
+        """Starts the room, or another one, anew; what was saved or could be undone is forgotten.
+
+        Raises:
+            ValueError: on an unknown room or a seed that is no integer; nothing changes then.
+        """
         if scene is not None:
-            self._task = FreePlay(scene)
-        self._seed = self._seed if seed is None else seed
-        self.session.reset(self._task, self._seed)
-        self._undo, self._redo, self._saved = [], [], {}
+            self._task = FreePlay(load_room(str(scene)).name)
+        if seed is not None:
+            self._seed = _integer("Reset", "seed", seed)
+        self._restart(self._task)
         self.last_event = self._event("Initialize", (), None)
         return self.last_event
+
+    def _restart(self, task: TaskLike) -> None:
+        self.session.reset(task, self._seed)
+        self._undo.clear()
+        self._redo.clear()
+        self._saved = {}
 
     def step(self, action: str | Mapping[str, Any] | None = None, **arguments: Any) -> Event:
         """Executes an action, or two arm actions in parallel or one after the other.
@@ -141,7 +180,7 @@ class Controller:
         call |= arguments
         if "actions" in call:
             return self._several(call)
-        name = str(call.pop("action", ""))
+        name = str(call.pop("action", ""))[:80]
         control = _CONTROL_ALIASES.get(name.lower())
         if control is not None:
             return self._control(control, call)
@@ -158,8 +197,13 @@ class Controller:
         unknown = sorted(set(call) - {"actions", "executionMode", "action"})
         if unknown:
             raise ValueError(f"unknown arguments {unknown}; allowed: actions, executionMode")
+        entries = call["actions"]
+        if not isinstance(entries, Sequence) or isinstance(entries, str) or not 1 <= len(entries) <= 2:
+            raise ValueError(f"actions must be a list of one or two actions, got {str(entries)[:80]!r}")
         actions: list[Action] = []
-        for entry in call["actions"]:
+        for entry in entries:
+            if not isinstance(entry, Mapping):
+                raise ValueError(f"an action is a mapping with the key action, got {str(entry)[:80]!r}")
             one = dict(entry)
             actions.append(to_action(str(one.pop("action", "")), one))
         steps = [PlanStep(tuple(actions))] if mode == "parallel" else [PlanStep((action,)) for action in actions]
@@ -178,9 +222,11 @@ class Controller:
         return self.last_event
 
     def _control(self, name: str, call: Mapping[str, Any]) -> Event:
-        unknown = sorted(set(call) - set(_CONTROL[name]))
+        unknown = sorted(map(str, set(call) - set(_CONTROL[name])))
         if unknown:
             raise ValueError(f"{name}: unknown arguments {unknown}; allowed: {', '.join(_CONTROL[name]) or 'none'}")
+        if name in _PRIVILEGED and not self._privileged:
+            raise ValueError(f"{name} needs Controller(privileged=True), got privileged=False")
         handlers: Mapping[str, Callable[[Mapping[str, Any]], Any]] = {
             "Undo": lambda _: self._travel(self._undo, self._redo),
             "Redo": lambda _: self._travel(self._redo, self._undo),
@@ -188,6 +234,9 @@ class Controller:
             "LoadState": self._load,
             "Reset": lambda c: self.reset(c.get("scene"), c.get("seed")) and None,
             "GetReachablePositions": lambda _: self._reachable(),
+            "GetInteractablePoses": self._interactable,
+            "SetObjectPoses": self._set_poses,
+            "InitialRandomSpawn": self._spawn,
             "TP": self._teleport,
             "Pass": lambda _: None,
         }
@@ -195,7 +244,7 @@ class Controller:
         self.last_event = self._event(name, (), result)
         return self.last_event
 
-    def _travel(self, source: list[SessionSnapshot], target: list[SessionSnapshot]) -> bool:
+    def _travel(self, source: deque[SessionSnapshot], target: deque[SessionSnapshot]) -> bool:
         """Moves along the undo history; False when there is nothing to go to."""
         if not source:
             return False
@@ -219,15 +268,62 @@ class Controller:
         points = self.session.body.navigation().free_positions()[::9]
         return [{"x": float(x), "y": float(y), "z": 0.0} for x, y in points]
 
+    def _interactable(self, call: Mapping[str, Any]) -> list[dict[str, Any]]:
+        name = str(call.get("objectId", ""))
+        self.session.world.object(name)
+        limit = _integer("GetInteractablePoses", "maxPoses", call.get("maxPoses", 100))
+        if not 1 <= limit <= _MAX_POSES:
+            raise ValueError(f"GetInteractablePoses: maxPoses {limit} outside 1..{_MAX_POSES}")
+        standing = self.session.robot.standing_pelvis_height_m
+        return [
+            {
+                "x": pose.x_m,
+                "y": pose.y_m,
+                "z": pose.pelvis_height_m,
+                "rotation": pose.yaw_deg,
+                "standing": pose.pelvis_height_m > standing - 0.05,
+                "arms": list(pose.arms),
+            }
+            for pose in interactable_poses(self.session.body, name, limit)
+        ]
+
+    def _set_poses(self, call: Mapping[str, Any]) -> bool:
+        poses = call.get("objectPoses")
+        if not isinstance(poses, Sequence) or isinstance(poses, str):
+            raise ValueError(f"SetObjectPoses: objectPoses must be a list of mappings, got {str(poses)[:80]!r}")
+        before = self.session.snapshot()
+        set_object_poses(self.session.world, poses)
+        self._undo.append(before)
+        self._redo.clear()
+        return True
+
+    def _spawn(self, call: Mapping[str, Any]) -> list[dict[str, str]]:
+        seed = _integer("InitialRandomSpawn", "randomSeed", call.get("randomSeed", 0))
+        lists: list[tuple[str, ...]] = []
+        for key in ("excludedReceptacles", "excludedObjectIds"):
+            names = call.get(key, ())
+            if not isinstance(names, Sequence) or isinstance(names, str):
+                raise ValueError(f"InitialRandomSpawn: {key} must be a list of ids or types, got {str(names)[:80]!r}")
+            lists.append(tuple(map(str, names)))
+        placements = random_placements(
+            self._task.room, np.random.default_rng(seed), excluded_receptacles=lists[0], excluded_objects=lists[1]
+        )
+        self._restart(FreePlay(self._task.room, placements=placements, seed=seed))
+        return [{"objectId": placement.object_id, "receptacle": placement.receptacle} for placement in placements]
+
     def _teleport(self, call: Mapping[str, Any]) -> bool:
-        if not self._privileged:
-            raise ValueError("TP needs Controller(privileged=True), got privileged=False")
         position = call.get("position", {})
-        x, y = float(call.get("x", position.get("x", 0.0))), float(call.get("y", position.get("y", 0.0)))
-        yaw = float(np.deg2rad(float(call.get("rotation", 0.0))))
+        if not isinstance(position, Mapping):
+            raise ValueError(f"TP: position must be a mapping with x and y, got {str(position)[:80]!r}")
+        x, y = (number("TP", axis, call.get(axis, position.get(axis, 0.0))) for axis in "xy")
+        rotation = call.get("rotation", 0.0)
+        if isinstance(rotation, Mapping):  # AI2-THOR: degrees about each axis
+            rotation = rotation.get("z", 0.0)
+        yaw = float(np.deg2rad(number("TP", "rotation", rotation)))
         if not self.session.body.navigation().is_free(np.array([x, y])):
             return False
         self._undo.append(self.session.snapshot())
+        self._redo.clear()
         self.session.teleport(x, y, yaw)
         return True
 
@@ -240,12 +336,19 @@ class Controller:
         visible = set(session.world.visible_objects(view.segmentation))
         for entry in metadata["objects"]:
             entry["visible"] = entry["objectId"] in visible
+            entry["obstructed"] = not entry["visible"]
         metadata |= {
             "lastAction": name,
             "lastActionSuccess": not failed and result is not False,
-            "errorCode": failed[0].code if failed else "",
+            "errorCode": THOR_CODES.get(failed[0].code, failed[0].code) if failed else "",
+            "failureCode": failed[0].code if failed else "",
+            "failureCategory": failed[0].category.value if failed and failed[0].category else "",
+            "margins": dict(failed[0].margins) if failed else {},
             "errorMessage": "; ".join(f"{outcome.action.to_text()}: {outcome.message}" for outcome in failed),
             "actionReturn": result,
+            "screenWidth": self._size,
+            "screenHeight": self._size,
+            "fov": float(session.world.model.camera(session.robot.head_camera).fovy[0]),
             "collided": any(outcome.code == "BlockedPath" for outcome in failed),
             "results": [
                 {
@@ -271,6 +374,14 @@ class Controller:
             color_to_object_id={(int(r), int(g), int(b)): names[i] for i, (r, g, b) in enumerate(palette)},
             third_party_camera_frames=[session.world.render(c, self._size, self._size).rgb for c in self._cameras],
         )
+
+
+def _integer(action: str, key: str, value: Any) -> int:
+    """A whole number of a call that fits a seed."""
+    found = number(action, key, value)
+    if found != int(found) or not 0 <= found < 2**63:
+        raise ValueError(f"{action}: {key} must be an integer from 0, got {str(value)[:80]}")
+    return int(value)
 
 
 def _palette(count: int) -> NDArray[np.uint8]:

@@ -1,12 +1,12 @@
 """AI2-THOR-style metadata of a world: one record per object, and the robot's.
 
 Paper: the scene state that DualTHOR returns. Frames: MuJoCo's (z up, metres); AI2-THOR's y-up frame is not used. Key names are
-AI2-THOR's, plus `heldBy` (arms that hold the object), `center` and `temperatureCelsius`.
+AI2-THOR's, plus `heldBy` (arms that hold the object), `center`, `temperatureCelsius`, and DualTHOR's `isMoveable`.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from sim.world import World
 
 __all__ = ["object_metadata", "temperature_name", "world_metadata"]
+
+
+#: A pelvis that is lower than standing by more than this is crouching, metres.
+_STANDING_M: Final = 0.05
 
 
 def temperature_name(celsius: float) -> str:
@@ -63,15 +67,18 @@ def object_metadata(world: World, thing: ObjectInstance, parents: tuple[str, ...
         "isPickedUp": bool(thing.held_by),
         "heldBy": list(thing.held_by),
         "moveable": thing.movable and not kind.pickupable,
+        "isMoveable": thing.movable,
         "isMoving": world.speed_of(thing.object_id) > 0.02,
         "isHeatSource": kind.has("heat_source"),
         "isColdSource": kind.has("cold_source"),
         "temperature": temperature_name(state.temperature),
         "temperatureCelsius": state.temperature,
         "mass": world.total_mass_kg(thing.object_id) if thing.movable else 0.0,
+        "salientMaterials": list(kind.materials),
         "parentReceptacles": list(parents),
         "receptacleObjectIds": list(contents),
         "axisAlignedBoundingBox": {"center": _xyz(center), "size": _xyz(high - low)},
+        "objectOrientedBoundingBox": {"cornerPoints": _corners(world, thing)},
     }
     return entry
 
@@ -106,14 +113,31 @@ def world_metadata(world: World) -> dict[str, Any]:
             "position": _xyz(pose[:3]),
             "rotation": {"x": 0.0, "y": 0.0, "z": float(np.degrees(pose[3]))},
             "pelvisHeight": float(pose[2]),
+            "isStanding": bool(pose[2] > world.robot.standing_pelvis_height_m - _STANDING_M),
+            "cameraHorizon": _horizon(world),
             "jointAngles": world.joint_positions(),
             "handOpening": {"left": world.hand_opening("left"), "right": world.hand_opening("right")},
         }
     return record
 
 
+def _horizon(world: World) -> float:
+    """Degrees by which the head camera looks below the horizon."""
+    assert world.robot is not None
+    camera = int(world.model.camera(world.robot.head_camera).id)
+    return float(np.degrees(np.arcsin(np.clip(world.data.cam_xmat[camera].reshape(3, 3)[2, 2], -1.0, 1.0))))
+
+
 def _xyz(values: Any) -> dict[str, float]:
     return {"x": float(values[0]), "y": float(values[1]), "z": float(values[2])}
+
+
+def _corners(world: World, thing: ObjectInstance) -> list[list[float]]:
+    """Eight corners of the box in the object's own axes, world frame, metres."""
+    ends = (thing.local_min, thing.local_max)
+    local = np.array([[ends[i][0], ends[j][1], ends[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    rotation = world.data.xmat[thing.body_id].reshape(3, 3)
+    return (local @ rotation.T + world.data.xpos[thing.body_id]).tolist()
 
 
 def _euler(world: World, thing: ObjectInstance) -> dict[str, float]:

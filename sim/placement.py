@@ -12,9 +12,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.catalogue import ObjectType
 from sim.objects import ObjectInstance, Surface
 
-__all__ = ["OVERHANG_SHARE", "REACH_BAND_M", "box_in_world", "find_free_spot", "resting_on"]
+__all__ = ["OVERHANG_SHARE", "REACH_BAND_M", "box_in_world", "find_free_spot", "fits_on", "resting_on"]
 
 #: Depth from a receptacle's reachable edge within which objects are put.
 REACH_BAND_M: Final = 0.35
@@ -30,6 +31,13 @@ def box_in_world(data: mujoco.MjData, thing: ObjectInstance) -> tuple[NDArray[np
     center = data.xpos[thing.body_id] + rotation @ ((thing.local_min + thing.local_max) / 2.0)
     half = np.abs(rotation) @ ((thing.local_max - thing.local_min) / 2.0)
     return center - half, center + half
+
+
+def fits_on(kind: ObjectType, place: ObjectType) -> bool:
+    """Whether an object can stand on a surface of a type, in any orientation, with its whole footprint."""
+    radius, height = float(np.hypot(kind.size[0], kind.size[1])) / 2.0, kind.size[2]
+    surfaces = [*place.surfaces, *(surface for moving in place.moving for surface in moving.surfaces)]
+    return any(min(s.rect[2], s.rect[3]) / 2.0 >= radius + 0.01 and (s.clearance >= height or not s.inside) for s in surfaces)
 
 
 def _is_hollow(thing: ObjectInstance) -> bool:

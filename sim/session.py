@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-import mujoco
 import numpy as np
 
 from data.records import Action, ActionKind, ActionOutcome, Arm, Feedback, HistoryItem, Observation, PlanStep
@@ -135,6 +134,7 @@ class Session:
         difficulty: easy, medium, hard or natural.
         image_size: side of the planner's picture, pixels; 0 draws none.
         contingency: name of the outcome distributions in `configs/contingency`.
+        all_known: whether actions may name any object, seen or not; not how planners are evaluated.
 
     Attributes:
         world, body, task, stats: of the running episode; only after `reset`.
@@ -144,8 +144,17 @@ class Session:
     body: Body
     task: TaskLike
 
-    def __init__(self, robot: str, difficulty: str = "easy", image_size: int = 112, contingency: str = "default") -> None:
+    def __init__(
+        self,
+        robot: str,
+        difficulty: str = "easy",
+        image_size: int = 112,
+        contingency: str = "default",
+        *,
+        all_known: bool = False,
+    ) -> None:
         self.robot = load_robot(robot)
+        self._all_known = all_known
         self.image_size = image_size
         self._config = load_contingency(contingency)
         self._luck = Contingency(self._config, difficulty, 0)
@@ -255,14 +264,12 @@ class Session:
         """Why an action would be refused right now, None when it would be tried. Moves nothing; for the privileged expert."""
         return assess_action(self.body, action, frozenset(self.known_objects))
 
-    def teleport(self, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Puts the base somewhere at once. Privileged; not an action of the grammar, and no part of any planner's episode."""
-        data, model = self.world.data, self.world.model
-        for name, value in (("base_x", x_m), ("base_y", y_m), ("base_yaw", yaw_rad)):
-            data.qpos[model.joint(name).qposadr[0]] = value
-            data.qvel[model.joint(name).dofadr[0]] = 0.0
-        self.world.set_base_target(x=x_m, y=y_m, yaw=yaw_rad)
-        mujoco.mj_forward(model, data)
+    def teleport(self, x_m: float, y_m: float, yaw_rad: float, pelvis_height_m: float | None = None) -> None:
+        """Puts the base somewhere at once, and what the hands hold with it; the pelvis height stays when it is None.
+
+        Privileged; not an action of the grammar, and no part of any planner's episode.
+        """
+        self.world.put_base(x_m, y_m, yaw_rad, pelvis_height_m)
 
     # ---- views
 
@@ -283,7 +290,8 @@ class Session:
     @property
     def known_objects(self) -> tuple[str, ...]:
         """Ids that actions may name: fixed furniture, and everything seen so far in the episode."""
-        return tuple(name for name, thing in self.world.objects.items() if not thing.movable or name in self._seen)
+        known = self.world.objects.items()
+        return tuple(name for name, thing in known if self._all_known or not thing.movable or name in self._seen)
 
     def goal_status(self) -> tuple[bool, ...]:
         """Whether each of the task's goals holds."""

@@ -333,6 +333,35 @@ class World:
         self.data.ctrl[self._actuator["base_pitch"]] = crouches.pitch(height)
         self.set_joint_targets(dict(zip(robot.leg_joints, map(float, crouches.legs(height)), strict=True)))
 
+    def put_base(self, x_m: float, y_m: float, yaw_rad: float, pelvis_height_m: float | None = None) -> None:
+        """Puts the robot somewhere at once, at rest, with what its hands hold; nothing else moves."""
+        mujoco.mj_forward(self.model, self.data)
+        held = {thing.object_id: None for thing in self.objects.values() if thing.movable and thing.held_by}
+        before = self.grasp_poses()
+        carried = {name: np.linalg.inv(before[self.objects[name].held_by[0]]) @ self.pose(name) for name in held}
+        self.set_base_target(x=x_m, y=y_m, yaw=yaw_rad)
+        if pelvis_height_m is not None:
+            self.command_height(pelvis_height_m)
+            for name in self._robot().leg_joints:
+                self.data.qpos[self.model.joint(name).qposadr[0]] = self.data.ctrl[self._actuator[name]]
+        for name in BASE_JOINTS if pelvis_height_m is not None else ("base_x", "base_y", "base_yaw"):
+            joint = self.model.joint(name)
+            self.data.qpos[joint.qposadr[0]] = self.data.ctrl[self._actuator[name]]
+            self.data.qvel[joint.dofadr[0]] = 0.0
+        mujoco.mj_kinematics(self.model, self.data)
+        after = self.grasp_poses()
+        for name, offset in carried.items():
+            thing = self.objects[name]
+            pose = after[thing.held_by[0]] @ offset
+            self.data.qpos[thing.qpos_adr : thing.qpos_adr + 3] = pose[:3, 3]
+            mujoco.mju_mat2Quat(self.data.qpos[thing.qpos_adr + 3 : thing.qpos_adr + 7], pose[:3, :3].flatten())
+            self.data.qvel[thing.dof_adr : thing.dof_adr + 6] = 0.0
+        mujoco.mj_forward(self.model, self.data)
+
+    def grasp_poses(self) -> dict[str, NDArray[np.float64]]:
+        """(4, 4) pose of each arm's grasp site, world frame."""
+        return {side: self.grasp_pose(side) for side in SIDES}
+
     def set_joint_targets(self, targets: Mapping[str, float]) -> None:
         """Commands named actuated joints (rad or m).
 

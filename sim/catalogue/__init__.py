@@ -20,6 +20,7 @@ from configs.validate import ConfigError, build
 
 __all__ = [
     "CATALOGUE_PATH",
+    "MATERIALS",
     "OPTIONS",
     "PROPERTIES",
     "SHAPES",
@@ -54,6 +55,12 @@ PROPERTIES: Final = (
     "heat_source",
     "cold_source",
 )
+
+
+MATERIALS: Final = (
+    "Metal", "Wood", "Plastic", "Glass", "Ceramic", "Stone", "Fabric", "Rubber", "Food", "Paper", "Wax", "Soap", "Sponge",
+    "Organic", "Leather",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +167,7 @@ class ObjectType:
         moving: doors and drawers.
         surfaces: where objects can rest.
         grips: `single` and `double` to preferred hand points in the type's frame, metres.
+        materials: AI2-THOR's salient materials, subset of `MATERIALS`.
         note: remark from the measurements.
     """
 
@@ -172,9 +180,13 @@ class ObjectType:
     moving: tuple[MovingSpec, ...] = ()
     surfaces: tuple[SurfaceSpec, ...] = ()
     grips: Mapping[str, tuple[tuple[float, float, float], ...]] = field(default_factory=dict)
+    materials: tuple[str, ...] = ()
     note: str = ""
 
     def __post_init__(self) -> None:
+        strange = sorted(set(self.materials) - set(MATERIALS))
+        if strange:
+            raise ValueError(f"{self.name}: unknown material {strange[0]!r}; allowed: {', '.join(MATERIALS)}")
         unknown = sorted(self.properties - set(PROPERTIES))
         if unknown:
             raise ValueError(f"{self.name}: unknown property {unknown[0]!r}; allowed: {', '.join(PROPERTIES)}")

@@ -317,19 +317,19 @@ class Body:
         """A world point in the pelvis frame, for a base and a pelvis height (the commanded ones by default)."""
         base = self.commanded_base() if base is None else base
         height = self.pelvis_height_m if pelvis_height_m is None else pelvis_height_m
-        return self.turn_to_pelvis(np.asarray(point, dtype=float) - (base.x, base.y, height))
+        return self.turn_to_pelvis(np.asarray(point, dtype=float) - (base.x, base.y, height), base)
 
     def _wish_in_pelvis(self, wish: HandPose, pelvis_height_m: float, base: Stance | None = None) -> HandPose:
         return HandPose(
             self.to_pelvis(wish.position, pelvis_height_m, base),
-            None if wish.pointing is None else self.turn_to_pelvis(wish.pointing),
-            None if wish.closing is None else self.turn_to_pelvis(wish.closing),
+            None if wish.pointing is None else self.turn_to_pelvis(wish.pointing, base),
+            None if wish.closing is None else self.turn_to_pelvis(wish.closing, base),
             wish.either_way,
         )
 
-    def turn_to_pelvis(self, direction: Array) -> Array:
+    def turn_to_pelvis(self, direction: Array, base: Stance | None = None) -> Array:
         """A world direction in the pelvis frame."""
-        yaw = self.commanded_base().yaw_rad
+        yaw = (self.commanded_base() if base is None else base).yaw_rad
         c, s = np.cos(yaw), np.sin(yaw)
         return np.array([c * direction[0] + s * direction[1], -s * direction[0] + c * direction[1], direction[2]])
 
@@ -339,10 +339,10 @@ class Body:
         c, s = np.cos(yaw), np.sin(yaw)
         return np.array([c * direction[0] - s * direction[1], s * direction[0] + c * direction[1], direction[2]])
 
-    def in_trunk(self, point: Array, pelvis_height_m: float | None = None) -> Array:
+    def in_trunk(self, point: Array, pelvis_height_m: float | None = None, base: Stance | None = None) -> Array:
         """A world point in the frame of the reach maps: the pelvis frame, turned with the trunk's lean."""
         height = self.pelvis_height_m if pelvis_height_m is None else pelvis_height_m
-        return self._lean(height).T @ self.to_pelvis(point, height)
+        return self._lean(height).T @ self.to_pelvis(point, height, base)
 
     def shoulder(self, arm: Arm) -> Array:
         """World position of a shoulder, from the commanded base."""
@@ -508,9 +508,9 @@ class Body:
         low, high = self.spec.pelvis_height_range_m
         return [float(h) for h in np.linspace(low, high, max(2, int(np.ceil((high - low) / _HEIGHT_STEP_M)) + 1))]
 
-    def within(self, arm: Arm, point: Array, pelvis_height_m: float) -> bool:
-        """Whether a world point is within the arm's envelope at a pelvis height, from this stance."""
-        return self.maps[arm.value].contains(self.in_trunk(point, pelvis_height_m))
+    def within(self, arm: Arm, point: Array, pelvis_height_m: float, base: Stance | None = None) -> bool:
+        """Whether a world point is within the arm's envelope at a pelvis height, from this stance or another one."""
+        return self.maps[arm.value].contains(self.in_trunk(point, pelvis_height_m, base))
 
     def vias(self, arm: Arm) -> tuple[Array, ...]:
         """(A,) postures that lead around furniture edges: ready, hand forward at shoulder height, hand above the shoulder."""

@@ -15,9 +15,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.catalogue import ObjectType, load_catalogue
+from sim.catalogue import load_catalogue
 from sim.navigation import NavigationMap
-from sim.placement import OVERHANG_SHARE
+from sim.placement import OVERHANG_SHARE, fits_on
 from sim.robots.build_solver import robot_kit
 from sim.robots.spec import load_robot
 from sim.rooms import load_room
@@ -97,7 +97,7 @@ def scene_of(room: str) -> Scene:
         rows: dict[str, tuple[str, ...]] = {}
         for name in types:
             kind = catalogue.get(name)
-            fits = tuple(place for place in places if _fits(kind, kinds[place]))
+            fits = tuple(place for place in places if fits_on(kind, kinds[place]))
             if layout.category in kind.rooms and fits:
                 rows[name] = fits
         return rows
@@ -112,13 +112,6 @@ def scene_of(room: str) -> Scene:
         small=table(_SMALL_TYPES, (*surfaces, *containers)),
         big=table(_BIG_TYPES, targets),
     )
-
-
-def _fits(kind: ObjectType, place: ObjectType) -> bool:
-    """Whether an object can stand on a surface of a type, in any orientation, with its whole footprint."""
-    radius, height = float(np.hypot(kind.size[0], kind.size[1])) / 2.0, kind.size[2]
-    surfaces = [*place.surfaces, *(surface for moving in place.moving for surface in moving.surfaces)]
-    return any(min(s.rect[2], s.rect[3]) / 2.0 >= radius + 0.01 and (s.clearance >= height or not s.inside) for s in surfaces)
 
 
 def sample_task(

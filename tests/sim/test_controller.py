@@ -43,9 +43,10 @@ def test_failures_are_reported(controller):
     controller.reset()
     event = controller.step(action="PutObject", objectId="CounterTop_1", arm="left")
     assert not event.metadata["lastActionSuccess"]
-    assert event.metadata["errorCode"] == "HandEmpty"
+    assert event.metadata["errorCode"] == "ObjectNotInInventory"
+    assert event.metadata["failureCode"] == "HandEmpty" and event.metadata["failureCategory"] == "logical"
     event = controller.step(action="PickupObject", objectId="Unicorn_1")
-    assert event.metadata["errorCode"] == "ObjectNotKnown"
+    assert event.metadata["errorCode"] == "ObjectNotVisible" and event.metadata["failureCode"] == "ObjectNotKnown"
 
 
 def test_parallel_pair_of_dualthor(controller):
