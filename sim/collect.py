@@ -19,11 +19,11 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from configs.arguments import read_arguments
 from configs.schema.collect import CollectConfig
-from configs.validate import ConfigError, build
+from configs.validate import ConfigError
 from data.shards import Manifest, ShardWriter, config_hash
 from data.workers import start_worker
 
@@ -115,23 +115,6 @@ def _computed(config: CollectConfig, missing: Sequence[int]) -> Iterator[tuple[i
             yield futures.pop(future), future.result()
 
 
-def parse(arguments: Sequence[str]) -> CollectConfig:
-    """Reads `key=value` arguments; lists are written `robots=[h1,x1]`.
-
-    Raises:
-        ConfigError: on an argument of another form, an unknown key, or a wrong value.
-    """
-    values: dict[str, Any] = {}
-    for argument in arguments:
-        key, sign, text = argument.partition("=")
-        if not sign:
-            raise ConfigError(
-                f"{argument!r} is not key=value; keys: {', '.join(f.name for f in dataclasses.fields(CollectConfig))}"
-            )
-        values[key] = yaml.safe_load(text)
-    return build(CollectConfig, values)
-
-
 def _with_bar(run: Callable[[Callable[[int, int], None]], Manifest], title: str) -> Manifest:
     columns = (
         TextColumn(title),
@@ -149,7 +132,7 @@ def _with_bar(run: Callable[[Callable[[int, int], None]], Manifest], title: str)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     try:
-        config = parse(sys.argv[1:] if arguments is None else arguments)
+        config = read_arguments(CollectConfig, sys.argv[1:] if arguments is None else arguments)
     except ConfigError as error:
         sys.stderr.write(f"{error}\n")
         return 2

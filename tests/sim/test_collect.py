@@ -5,12 +5,13 @@ import json
 import numpy as np
 import pytest
 
+from configs.arguments import read_arguments
 from configs.schema.collect import CollectConfig
 from configs.validate import ConfigError
 from data.motion import N_FEATURES
 from data.records import Action, Arm, PlanStep
 from data.shards import ShardReader, decode_depth, decode_png, decode_segmentation
-from sim.collect import collect, main, parse, parts_of, rows_of_part
+from sim.collect import collect, main, parts_of, rows_of_part
 from sim.demonstrations import perturbed, run_correction, run_episode
 from sim.posed_views import type_names
 
@@ -133,16 +134,16 @@ def test_perturbed_steps_are_legal_and_differ(step):
 
 
 def test_arguments_are_read_and_wrong_ones_refused(capsys):
-    assert parse(["kind=views", "out=x", "count=3", "robots=[x1]"]).robots == ("x1",)
+    assert read_arguments(CollectConfig, ["kind=views", "out=x", "count=3", "robots=[x1]"]).robots == ("x1",)
     with pytest.raises(ConfigError, match="views, demos, exercises, judgements"):
-        parse(["kind=pictures", "out=x", "count=3"])
+        read_arguments(CollectConfig, ["kind=pictures", "out=x", "count=3"])
     with pytest.raises(ConfigError, match="'count' is not key=value"):
-        parse(["count"])
+        read_arguments(CollectConfig, ["count"])
     with pytest.raises(ConfigError, match="count must be at least 1, got 0"):
-        parse(["kind=views", "out=x", "count=0"])
+        read_arguments(CollectConfig, ["kind=views", "out=x", "count=0"])
     with pytest.raises(ConfigError, match=r"noise must be within \[0, 1\], got 2"):
-        parse(["kind=demos", "out=x", "count=1", "noise=2"])
+        read_arguments(CollectConfig, ["kind=demos", "out=x", "count=1", "noise=2"])
     with pytest.raises(ConfigError, match="robots and rooms must not be empty"):
-        parse(["kind=demos", "out=x", "count=1", "robots=[]"])
+        read_arguments(CollectConfig, ["kind=demos", "out=x", "count=1", "robots=[]"])
     assert main(["colour=red"]) == 2
     assert "colour" in capsys.readouterr().err
