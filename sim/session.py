@@ -10,7 +10,7 @@ Paper: problem formulation (observation, dual-arm action, feedback), undo and re
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -138,6 +138,7 @@ class Session:
 
     Attributes:
         world, body, task, stats: of the running episode; only after `reset`.
+        watchers: called with the world and the text of the running step after every control tick; they must change nothing.
     """
 
     world: World
@@ -159,6 +160,7 @@ class Session:
         self._config = load_contingency(contingency)
         self._luck = Contingency(self._config, difficulty, 0)
         self.stats = SessionStats()
+        self.watchers: list[Callable[[World, str], None]] = []
         self._seen: set[str] = set()
         self._history: list[HistoryItem] = []
         self._ended = False
@@ -239,7 +241,7 @@ class Session:
         started = self.world.time_s
         skills = skills_for(self.body, step, frozenset(self.known_objects), self.draw)
         place = self.body.base().position
-        path = 0.0
+        path, text = 0.0, step.to_text()
 
         def advance() -> None:
             nonlocal place, path
@@ -247,6 +249,8 @@ class Session:
             now = self.body.base().position
             path += float(np.linalg.norm(now - place))
             place = now
+            for watch in self.watchers:
+                watch(self.world, text)
 
         outcomes = run_skills(skills, advance)
         if path > 0.01:  # less is the servos' tremor
