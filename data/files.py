@@ -9,16 +9,49 @@ import contextlib
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
-__all__ = ["file_hash", "new_folder", "write_text"]
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["cache_folder", "file_hash", "new_folder", "read_cached", "write_cached", "write_text"]
 
 
 def file_hash(path: Path) -> str:
     """SHA-256 of a file, 64 hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def cache_folder() -> Path:
+    """Where what is computed once per machine is kept: `proprio-mllm` in the user's cache folder (`XDG_CACHE_HOME`)."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "proprio-mllm"
+
+
+def read_cached(name: str) -> dict[str, NDArray[Any]] | None:
+    """Arrays that were kept under a name, which must hold the hash of all they depend on; None when there are none."""
+    try:
+        with np.load(cache_folder() / f"{name}.npz", allow_pickle=False) as file:
+            return {key: file[key] for key in file.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def write_cached(name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Keeps arrays under a name; where the folder cannot be written nothing is kept, and nothing fails."""
+    path = cache_folder() / f"{name}.npz"
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("wb") as file:
+            np.savez(file, **arrays)  # type: ignore[arg-type]
+        os.replace(temporary, path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -27,6 +27,8 @@ __all__ = ["CAMERAS", "Renderer", "RenderingError", "View", "camera_intrinsics",
 CAMERAS: Final = ("head", "front", "left", "right", "behind", "top", "overview", "plan")
 MAX_SIZE: Final = 1280
 _MAX_GEOMS: Final = 1500
+#: A geom group that is not drawn.
+_UNSEEN_GROUP: Final = 5
 _ROBOT: Final = -2
 _NOTHING: Final = -1
 
@@ -92,7 +94,7 @@ class Renderer:
     def __init__(self, world: World, height: int = 112, width: int = 112, *, pretty: bool = False) -> None:
         if not (1 <= height <= MAX_SIZE and 1 <= width <= MAX_SIZE):
             raise ValueError(f"image size {height} x {width} outside 1..{MAX_SIZE}")
-        self._world, self._height, self._width = world, height, width
+        self._world, self._height, self._width, self._pretty = world, height, width, pretty
         self._canvas = shared_canvas(world.model, world.model_name, height, width)
         self._scene = mujoco.MjvScene(world.model, maxgeom=_MAX_GEOMS)
         self._option = mujoco.MjvOption()
@@ -107,6 +109,19 @@ class Renderer:
         labels = np.where(robot, _ROBOT, world.object_of_geom).astype(np.int32)
         self._labels = np.append(labels, _NOTHING)  # the last entry is what geom -1, the sky, maps to
 
+    def _out_of_view(self, camera: int) -> NDArray[np.bool_]:
+        """(ngeom,) geoms whose bounding spheres lie behind a camera or beside its view; planes are never left out."""
+        model, data = self._world.model, self._world.data
+        axes = data.cam_xmat[camera].reshape(3, 3)
+        offsets = (data.geom_xpos - data.cam_xpos[camera]) @ axes  # right, up, back
+        radius = model.geom_rbound
+        half = np.radians(float(model.cam_fovy[camera])) / 2.0
+        out = offsets[:, 2] > radius
+        for lateral, share in ((offsets[:, 1], 1.0), (offsets[:, 0], self._width / self._height)):
+            edge = np.arctan(np.tan(half) * share)
+            out |= np.abs(lateral) * np.cos(edge) + offsets[:, 2] * np.sin(edge) > radius
+        return out & (radius > 0.0)
+
     def view(self, camera: str = "head", *, depth: bool = False, segmentation: bool = False) -> View:
         """Draws one camera as the world is now.
 
@@ -117,7 +132,12 @@ class Renderer:
         self._camera.fixedcamid = _camera_id(world, camera)
         mujoco.mj_camlight(world.model, world.data)
         everything = int(mujoco.mjtCatBit.mjCAT_ALL)
+        groups = world.model.geom_group
+        kept = groups.copy()
+        if not self._pretty:  # shadows come from what is not in view, too
+            groups[self._out_of_view(self._camera.fixedcamid)] = _UNSEEN_GROUP
         mujoco.mjv_updateScene(world.model, world.data, self._option, None, self._camera, everything, self._scene)
+        groups[:] = kept
         distances = labels = None
         if depth or segmentation:
             metres, geoms = self._canvas.depth_and_geoms(world.model, self._scene)

@@ -3,15 +3,18 @@
 Inverse kinematics with few degrees of freedom (H1: five per arm) has local minima and no room for an arbitrary hand
 orientation. The table answers both: for a point it gives the posture whose hand points best, as the start of the solver, and it
 tells at which other pelvis heights the point would be in reach. Sampling is uniform over the joint ranges, with a fixed seed,
-once per robot.
+once per robot and machine.
 
 Frames: `pelvis` is the pelvis heading frame. Shape letters: S samples, A arm joints.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -19,6 +22,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from data.files import read_cached, write_cached
 from sim.robots.build_solver import RobotKit
 from sim.robots.kinematics import RobotModel
 
@@ -27,6 +31,9 @@ __all__ = ["WOUND_RAD", "HandPose", "ReachMap", "reach_maps"]
 Array = NDArray[np.float64]
 
 _SAMPLES: Final = 80000
+#: Raised when the meaning of the arrays changes.
+_VERSION: Final = 1
+_FIELDS: Final = ("q", "positions", "x_axes", "y_axes", "shoulder")
 #: Postures that are farther than this from the carrying one in any joint are left out: such arms are wound up.
 WOUND_RAD: Final = 2.0
 #: A point counts as within the envelope when a sampled hand is at most this far from it.
@@ -126,12 +133,30 @@ class ReachMap:
 
 @lru_cache(maxsize=4)
 def reach_maps(kit: RobotKit) -> dict[str, ReachMap]:
-    """The reach maps of a robot's `left` and `right` arm, waist straight."""
+    """The reach maps of a robot's `left` and `right` arm, waist straight; kept in the user's cache by all they depend on."""
+    spec = kit.spec
+    described = repr(dataclasses.replace(spec, mjcf_path=Path()))
+    key = hashlib.sha256(spec.mjcf_path.read_bytes() + f"{described}|{_SAMPLES}|{WOUND_RAD}|{_VERSION}".encode()).hexdigest()
+    name = f"reach-{spec.name}-{key[:24]}"
+    arrays = read_cached(name)
+    if arrays is None or set(arrays) != {f"{side}/{field}" for side in spec.arms for field in _FIELDS}:
+        arrays = _sampled(kit)
+        write_cached(name, arrays)
+    maps: dict[str, ReachMap] = {}
+    for side in spec.arms:
+        q, positions, x_axes, y_axes, shoulder = (arrays[f"{side}/{field}"] for field in _FIELDS)
+        reach = float(np.linalg.norm(positions - shoulder, axis=1).max())
+        maps[side] = ReachMap(q, positions, x_axes, y_axes, shoulder, reach, KDTree(positions))
+    return maps
+
+
+def _sampled(kit: RobotKit) -> dict[str, Array]:
+    """Samples the postures of both arms: the arrays of `ReachMap`, by side and field."""
     spec = kit.spec
     robot = RobotModel(spec)
     rng = np.random.default_rng(20)
     base = robot.configuration(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), robot.posture())
-    maps: dict[str, ReachMap] = {}
+    found: dict[str, Array] = {}
     columns = {side: robot.indices(arm.joints) for side, arm in spec.arms.items()}
     slots = {
         side: np.array([robot.model.joints[robot.model.getJointId(name)].idx_q for name in arm.joints])
@@ -157,8 +182,6 @@ def reach_maps(kit: RobotKit) -> dict[str, ReachMap]:
         positions = hands[side][:, 0].copy()
         wound = np.abs(draws[side] - np.asarray(spec.arms[side].carry))[:, :-1].max(axis=1)  # the wrist may roll freely
         sensible = (positions[:, 0] > -0.05) & (wound < WOUND_RAD)  # hands behind the back are of no use
-        reach = float(np.linalg.norm(positions[sensible] - shoulder, axis=1).max())
-        kept = positions[sensible]
-        x_axes, y_axes = hands[side][sensible, 1], hands[side][sensible, 2]
-        maps[side] = ReachMap(draws[side][sensible], kept, x_axes, y_axes, shoulder, reach, KDTree(kept))
-    return maps
+        values = (draws[side][sensible], positions[sensible], hands[side][sensible, 1], hands[side][sensible, 2], shoulder)
+        found |= {f"{side}/{field}": np.ascontiguousarray(value) for field, value in zip(_FIELDS, values, strict=True)}
+    return found

@@ -9,7 +9,7 @@ import pytest
 from sim.canvas import Canvas
 from sim.gl import RenderingError, select_backend
 from sim.objects import ObjectPlacement
-from sim.rendering import CAMERAS
+from sim.rendering import CAMERAS, Renderer
 from sim.robots.spec import load_robot
 from sim.world import World
 
@@ -107,3 +107,19 @@ def test_bad_requests_are_refused(world: World, monkeypatch: pytest.MonkeyPatch)
 
 def _broken(*_: object) -> None:
     raise RuntimeError("no display")
+
+
+@pytest.mark.parametrize("room", ["kitchen_1", "bathroom_2"])
+def test_leaving_out_what_is_not_in_view_changes_no_pixel(room: str) -> None:
+    world = World(load_robot("x1"), room)
+    renderer = Renderer(world, 96, 128)
+    for yaw in (0.0, 1.1, 2.5, -1.7):
+        world.put_base(*world.base_pose[:2], yaw)
+        for camera in CAMERAS:
+            culled = renderer.view(camera, depth=True, segmentation=True)
+            renderer._out_of_view = lambda _: np.zeros(world.model.ngeom, dtype=bool)  # type: ignore[method-assign]
+            whole = renderer.view(camera, depth=True, segmentation=True)
+            del renderer._out_of_view
+            for name in ("rgb", "depth", "segmentation"):
+                assert np.array_equal(getattr(culled, name), getattr(whole, name)), (camera, name)
+    assert renderer._out_of_view(int(world.model.camera(world.robot.head_camera).id)).mean() > 0.2  # type: ignore[union-attr]
