@@ -24,7 +24,7 @@ from sim.session import Session
 from sim.tasks.task import load_benchmark
 from sim.world import World
 
-__all__ = ["contact_sheet", "main", "robot_poses", "room_pictures"]
+__all__ = ["contact_sheet", "main", "robot_poses", "room_pictures", "room_sheet"]
 
 
 def room_pictures(folder: Path, robot: str = "h1") -> list[Path]:
@@ -43,6 +43,14 @@ def room_pictures(folder: Path, robot: str = "h1") -> list[Path]:
             iio.imwrite(path, world.render(camera, height, width).rgb)
             written.append(path)
     return written
+
+
+def room_sheet(width: int = 400, columns: int = 4) -> NDArray[np.uint8]:
+    """(rows * 0.75 * width, columns * width, 3) every room from above, with its objects, in the order of their names."""
+    tiles = [World(None, room).render("overview", width * 3 // 4, width).rgb for room in room_names()]
+    rows = -(-len(tiles) // columns)
+    tiles += [np.full_like(tiles[0], 255)] * (rows * columns - len(tiles))
+    return np.concatenate([np.concatenate(tiles[r * columns : (r + 1) * columns], axis=1) for r in range(rows)], axis=0)
 
 
 def contact_sheet(size: int = 112, columns: int = 12) -> NDArray[np.uint8]:
@@ -100,7 +108,8 @@ def main(folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     sheet = folder / "types.png"
     iio.imwrite(sheet, contact_sheet())
-    written = [sheet, *room_pictures(folder)]
+    iio.imwrite(folder / "rooms.png", room_sheet())
+    written = [sheet, folder / "rooms.png", *room_pictures(folder)]
     for robot in ("h1", "x1"):
         written.append(folder / f"{robot}_poses.png")
         iio.imwrite(written[-1], robot_poses(robot))
