@@ -1,8 +1,8 @@
 """Where rooms, object types, robots and contingencies are read from: the project's files, and a folder of one's own.
 
 The environment variable `DUALTHOR_ASSETS` names that folder. It may hold `rooms/NAME.yaml`, `types/NAME.yaml`,
-`robots/NAME.yaml` and `contingency/NAME.yaml`, in the formats of the project's own files. What is there is added; a name that the
-project has already is refused, so that no table can silently be about another room or robot than its name says.
+`robots/NAME.yaml` and `contingency/NAME.yaml`, in the formats of the project's own files. What is there is added; a name that
+the project has already is refused, so that no table can silently be about another room or robot than its name says.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ def own_files(kind: str) -> dict[str, Path]:
     folder = Path(root).expanduser().resolve()
     if not folder.is_dir():
         raise ConfigError(f"{ASSETS_VARIABLE}={root!r} is not a folder")
-    strange = sorted(path.name for path in folder.iterdir() if path.is_dir() and path.name[0] not in "._" and path.name not in KINDS)
+    strange = sorted(
+        path.name for path in folder.iterdir() if path.is_dir() and path.name[0] not in "._" and path.name not in KINDS
+    )
     if strange:
         raise ConfigError(f"{ASSETS_VARIABLE}: folder {strange[0]!r} is no kind of asset; allowed: {', '.join(KINDS)}")
     return {path.stem: path for path in sorted((folder / kind).glob("*.yaml"))}

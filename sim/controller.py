@@ -2,9 +2,9 @@
 
 The same session, physics and failure codes as everywhere else, behind the interface that users of AI2-THOR and DualTHOR know.
 Action names of both are understood (`sim.aliases`), DualTHOR's `{"actions": [a, b], "executionMode": "parallel"}` included. A
-failed action returns an event with `lastActionSuccess` False, an `errorCode` of AI2-THOR where it has one, and our `failureCode`;
-an unknown action or argument raises ValueError and changes nothing. Scripts written for DualTHOR's own Controller use
-`sim.dualthor`.
+failed action returns an event with `lastActionSuccess` False, an `errorCode` of AI2-THOR where it has one, and our
+`failureCode`; an unknown action or argument raises ValueError and changes nothing. Scripts written for DualTHOR's own
+Controller use `sim.dualthor`.
 
 Episode control that is not part of the planner's grammar lives here: Undo, Redo, SaveState, LoadState, Reset,
 GetReachablePositions, and with `privileged=True` what looks at the state or changes it by hand: TP (teleport),

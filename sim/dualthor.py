@@ -9,9 +9,9 @@ A script written for DualTHOR's `controller.Controller` runs with its import and
 What DualTHOR's constructor takes for Unity (`config_path`, `start_unity_exe`, `host`, `port`) is accepted and has no use here.
 A step returns `{success, imgpath, msg, sceneState}`, or `results` in place of `msg` for two actions; ids have DualTHOR's form
 (`Kitchen_Mug_01`). As there, all objects are known from the start and `tp` brings the robot to a place from which the object is
-within reach. Unlike there: actions succeed by physics only, an action without an arm takes the one that can do it, and what goes
-wrong is a reply that says so, never an exception. Left out: `break`, which DualTHOR's tasks name and its actions lack, is refused
-here too.
+within reach. Unlike there: actions succeed by physics only, an action without an arm takes the one that can do it, and what
+goes wrong is a reply that says so, never an exception. Left out: `break`, which DualTHOR's tasks name and its actions lack, is
+refused here too.
 """
 
 from __future__ import annotations
@@ -170,7 +170,10 @@ class Controller:
 
     def _translate(self, name: str, arguments: Mapping[str, Any]) -> str:
         """An action of the grammar for one of DualTHOR's; an arm that is not named is the one that can do it."""
-        values = {key: self._own_id(value) if key in ("objectID", "objectId", "container") else value for key, value in arguments.items()}
+        values = {
+            key: self._own_id(value) if key in ("objectID", "objectId", "container") else value
+            for key, value in arguments.items()
+        }
         if name == "toggle":
             target = str(values.get("objectID", values.get("objectId", "")))
             on = target in self.session.world.objects and self.session.world.objects[target].state.isToggled
@@ -214,9 +217,7 @@ class Controller:
             raise ValueError(f"unknown object {call.get('objectID')!r} in {world.room.name}")
         comfort = body.comfortable_distance_m()
         point = body.interaction_point(name)
-        best = best_stance(
-            body.navigation(), body.commanded_base(), point[:2], comfort, None, 0.0, body.faces_rad(name)
-        )
+        best = best_stance(body.navigation(), body.commanded_base(), point[:2], comfort, None, 0.0, body.faces_rad(name))
         reachable = interactable_poses(body, name, limit=1000)
         if best is None and not reachable:
             return self._reply("tp", False, f"there is no place to stand near {call.get('objectID')}")

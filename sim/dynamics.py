@@ -1,8 +1,8 @@
-"""What changes by itself besides rigid bodies: heat, filling under a tap, breakage by impact, and how states look.
+"""What changes by itself besides rigid bodies: heat, liquids (`sim.liquids`), breakage by impact, and how states look.
 
-Simple laws on purpose: a temperature approaches that of its surroundings exponentially, a vessel below a running tap fills, a
-breakable object that stops from more than 2.6 m/s (a fall of 0.35 m) within one recorder frame breaks. Paper: state changes of
-DualTHOR.
+Simple laws on purpose: a temperature approaches that of its surroundings exponentially, a breakable object that stops from more
+than 2.6 m/s (a fall of 0.35 m) within one recorder frame breaks. What is cooked, broken, sliced or used up stays so. Paper:
+state changes of DualTHOR.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sim import liquids
 from sim.objects import ROOM_TEMPERATURE_C
 
 if TYPE_CHECKING:
@@ -26,7 +27,8 @@ _SECONDS: Final = {"heat": 8.0, "cold": 20.0, "room": 90.0}
 
 
 def tick(world: World) -> None:
-    """One second of heat, taps and cooking."""
+    """One second of liquids, heat and cooking."""
+    liquids.flow(world, TICK_S)
     active = [thing for thing in world.objects.values() if thing.state.isToggled]
     cold = [thing for thing in world.objects.values() if thing.type.has("cold_source")]
     if not active and all(abs(t.state.temperature - ROOM_TEMPERATURE_C) < 0.5 for t in world.objects.values()) and not cold:
@@ -44,14 +46,6 @@ def tick(world: World) -> None:
         state.temperature += (target - state.temperature) * (1.0 - float(np.exp(-TICK_S / seconds)))
         if thing.type.has("cookable") and state.temperature > _COOKED_C and not state.isCooked:
             world.set_state(name, "isCooked", True)
-    for source in active:
-        target_id = world.room.links.get(source.object_id)
-        if source.type.name != "Faucet" or target_id is None:
-            continue
-        below = [target_id, *(name for name, above in parents.items() if target_id in above)]
-        for name in below:
-            if world.objects[name].type.fillable and not world.objects[name].state.isFilledWithLiquid:
-                world.set_state(name, "fillLiquid", "water")
 
 
 def break_by_impact(world: World, before: dict[str, float]) -> None:
@@ -69,12 +63,12 @@ def look(world: World, thing: ObjectInstance) -> None:
     for geom, part in world.part_of_geom[thing.object_id]:
         rgba = np.array(colors[part.color], dtype=float)
         if "liquid" in part.options:
-            if not state.isFilledWithLiquid:
+            rgba = liquids.color_of(world, state.fillLiquid)
+            if state.fillLitres <= 0.0:
                 rgba[3] = 0.0
-            elif state.fillLiquid == "coffee":
-                rgba = np.array(colors["coffee"])
-            else:
-                rgba = np.array(colors["maroon"]) if state.fillLiquid == "wine" else np.array([0.30, 0.55, 0.95, 0.9])
+            world.show_level(thing, geom, part)
+        elif part.options & {"whole", "slice"} and state.isSliced != ("slice" in part.options):
+            rgba[3] = 0.0
         elif "glow" in part.options:
             if state.isToggled:
                 rgba = np.array(colors.get(f"{part.color}_on", colors[part.color]), dtype=float)

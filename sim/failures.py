@@ -44,6 +44,13 @@ class FailureCode(StrEnum):
     NOT_RECEPTACLE = "NotReceptacle"
     RECEPTACLE_CLOSED = "ReceptacleClosed"
     RECEPTACLE_FULL = "ReceptacleFull"
+    NOT_SLICEABLE = "NotSliceable"
+    NOT_DIRTY = "NotDirty"
+    NOT_USABLE = "NotUsable"
+    NOT_FILLABLE = "NotFillable"
+    NEEDS_TOOL = "NeedsTool"
+    EMPTY = "Empty"
+    SOURCE_OFF = "SourceOff"
     ALREADY_IN_STATE = "AlreadyInState"
     ALREADY_HELD = "AlreadyHeld"
     IN_USE = "InUse"
@@ -51,6 +58,8 @@ class FailureCode(StrEnum):
     BOTH_HANDS_BUSY = "BothHandsBusy"
     OBSTRUCTED = "Obstructed"
     GRASP_MISSED = "GraspMissed"
+    TOOL_MISSED = "ToolMissed"
+    POUR_MISSED = "PourMissed"
     DROPPED = "Dropped"
     PLACE_MISSED = "PlaceMissed"
     HANDLE_SLIPPED = "HandleSlipped"
@@ -99,6 +108,15 @@ FAILURES: Final[Mapping[FailureCode, FailureSpec]] = {
     FailureCode.NOT_RECEPTACLE: FailureSpec(_LOGIC, "nothing can be put on or in the object"),
     FailureCode.RECEPTACLE_CLOSED: FailureSpec(_LOGIC, "the receptacle is closed"),
     FailureCode.RECEPTACLE_FULL: FailureSpec(_LOGIC, "no free spot on or in the receptacle fits the object"),
+    FailureCode.NOT_SLICEABLE: FailureSpec(_LOGIC, "the object cannot be sliced"),
+    FailureCode.NOT_DIRTY: FailureSpec(_LOGIC, "the object is clean, and nothing is spilled on it"),
+    FailureCode.NOT_USABLE: FailureSpec(_LOGIC, "there is nothing in the object to use up"),
+    FailureCode.NOT_FILLABLE: FailureSpec(_LOGIC, "the object holds no liquid, or gives none"),
+    FailureCode.NEEDS_TOOL: FailureSpec(
+        _LOGIC, "the hand does not hold what the action takes: a knife, a sponge or towel, a vessel"
+    ),
+    FailureCode.EMPTY: FailureSpec(_LOGIC, "there is nothing to pour in the vessel that the hand holds"),
+    FailureCode.SOURCE_OFF: FailureSpec(_LOGIC, "nothing comes out of the source, switch it on"),
     FailureCode.ALREADY_IN_STATE: FailureSpec(_LOGIC, "the object already is in the state that the action makes"),
     FailureCode.ALREADY_HELD: FailureSpec(_LOGIC, "the object is already in a hand"),
     FailureCode.IN_USE: FailureSpec(_LOGIC, "the object or receptacle is in use by the other arm"),
@@ -106,6 +124,8 @@ FAILURES: Final[Mapping[FailureCode, FailureSpec]] = {
     FailureCode.BOTH_HANDS_BUSY: FailureSpec(_LOGIC, "both hands hold one object"),
     FailureCode.OBSTRUCTED: FailureSpec(_LOGIC, "in reach, but no pose of the arm gets there without a collision", ("gap_m",)),
     FailureCode.GRASP_MISSED: FailureSpec(_LOGIC, "the fingers closed without touching the object from two sides", ("gap_m",)),
+    FailureCode.TOOL_MISSED: FailureSpec(_LOGIC, "the tool or the hand came to rest beside the object", ("gap_m",)),
+    FailureCode.POUR_MISSED: FailureSpec(_LOGIC, "the liquid went beside the target", ("missed_l",)),
     FailureCode.DROPPED: FailureSpec(_LOGIC, "the object was lost on the way"),
     FailureCode.PLACE_MISSED: FailureSpec(_LOGIC, "the object did not come to rest on or in the receptacle", ("gap_m",)),
     FailureCode.HANDLE_SLIPPED: FailureSpec(_LOGIC, "the hand moved but the door or drawer did not follow", ("gap_m",)),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sim import liquids
 from sim.placement import box_in_world
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ def object_metadata(world: World, thing: ObjectInstance, parents: tuple[str, ...
         "canFillWithLiquid": kind.fillable,
         "isFilledWithLiquid": state.isFilledWithLiquid,
         "fillLiquid": state.fillLiquid or None,
+        "fillLitres": state.fillLitres,
         "dirtyable": kind.has("dirtyable"),
         "isDirty": state.isDirty,
         "canBeUsedUp": kind.has("used_up"),
@@ -104,6 +106,7 @@ def world_metadata(world: World) -> dict[str, Any]:
             for thing in world.objects.values()
             if thing.held_by
         ],
+        "spills": liquids.facts(world),
         "time": world.time_s,
     }
     if world.robot is not None:

@@ -71,6 +71,7 @@ class ObjectState:
     Attributes:
         isToggled, isBroken, isFilledWithLiquid, isDirty, isCooked, isSliced, isUsedUp: as in AI2-THOR.
         fillLiquid: water, coffee or wine, `""` when empty.
+        fillLitres: how much of it.
         temperature: degrees Celsius.
     """
 
@@ -78,6 +79,7 @@ class ObjectState:
     isBroken: bool = False  # noqa: N815
     isFilledWithLiquid: bool = False  # noqa: N815
     fillLiquid: str = ""  # noqa: N815
+    fillLitres: float = 0.0  # noqa: N815
     isDirty: bool = False  # noqa: N815
     isCooked: bool = False  # noqa: N815
     isSliced: bool = False  # noqa: N815
@@ -200,7 +202,10 @@ def index_object(model: mujoco.MjModel, object_id: str, catalogue: Catalogue) ->
         surfaces += [Surface(spec, door, np.asarray(moving.at, dtype=float)) for spec in moving.surfaces]
     bodies = (body, *(part.body_id for part in parts))
     geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
-    low, high = _local_box(model, body, geoms)
+    slices = {f"{object_id}/{index}" for index, part in enumerate(kind.parts) if "slice" in part.options}
+    # what appears when it is sliced lies within or beside the whole, whose box counts
+    whole = geoms if not slices else np.array([geom for geom in geoms if str(model.geom(int(geom)).name) not in slices])
+    low, high = _local_box(model, body, whole)
     toggle = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_SITE), f"{object_id}/toggle")
     return ObjectInstance(
         object_id=object_id,

@@ -26,11 +26,15 @@ from numpy.typing import NDArray
 from sim.catalogue import Catalogue, MovingSpec, ObjectType, Part, load_catalogue
 from sim.rooms import Room, load_room
 
+#: Geoms that show spilled liquid, see `sim.liquids`.
+PUDDLES: Final = 6
+
 __all__ = [
     "BASE_JOINTS",
     "HELD_BITS",
     "HELD_DOOR_BITS",
     "MOVABLE_BITS",
+    "PUDDLES",
     "STATIC_BITS",
     "TIMESTEP_S",
     "RobotForScene",
@@ -90,7 +94,23 @@ class SceneKey:
 @functools.lru_cache(maxsize=24)
 def compile_scene(key: SceneKey) -> mujoco.MjModel:
     """The compiled model of a scene, cached; copy it before changing anything in it."""
-    return build_spec(key).compile()
+    model = build_spec(key).compile()
+    for object_id in key.object_ids:
+        _measure_whole(model, object_id)
+    return model
+
+
+def _measure_whole(model: mujoco.MjModel, object_id: str) -> None:
+    """Gives the turning of an object the length of its whole shape: slices, not seen yet, would put it to sleep later."""
+    kind = load_catalogue().get(object_id.rsplit("_", 1)[0])
+    slices = {f"{object_id}/{index}" for index, part in enumerate(kind.parts) if "slice" in part.options}
+    if not slices:
+        return
+    body = model.body(object_id)
+    geoms = [g for g in np.flatnonzero(model.geom_bodyid == body.id) if str(model.geom(int(g)).name) not in slices]
+    reach = np.linalg.norm(model.geom_pos[geoms] - model.body_ipos[body.id], axis=1) + model.geom_rbound[geoms]
+    first = int(body.dofadr[0])
+    model.dof_length[first + 3 : first + 6] = float(reach.max())
 
 
 def build_spec(key: SceneKey) -> mujoco.MjSpec:
@@ -206,6 +226,11 @@ def _add_room(spec: mujoco.MjSpec, room: Room, catalogue: Catalogue) -> None:
         geom.quat = _quat(axes[:3], axes[3:])
     for index, part in enumerate(room.decor):
         _add_part(spec, world, f"decor/{index}", part, (0.0, 0.0, 0.0), catalogue, STATIC_BITS, 0.0)
+    for index in range(PUDDLES):  # spilled liquid is shown by them, see sim.liquids
+        world.add_geom(
+            name=f"puddle/{index}", type=int(mujoco.mjtGeom.mjGEOM_CYLINDER), size=[0.03, 0.001, 0.0],
+            pos=[cx, cy, -1.0 - index], rgba=[0.0, 0.0, 0.0, 0.0], contype=0, conaffinity=0,
+        )  # fmt: skip
     directional = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     for direction, strength in (([0.3, 0.4, -1.0], 0.35), ([-0.5, -0.6, -0.5], 0.18)):
         world.add_light(

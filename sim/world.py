@@ -11,6 +11,8 @@ from the height.
 from __future__ import annotations
 
 import copy
+import dataclasses
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
@@ -18,8 +20,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sim import dynamics
-from sim.catalogue import Part, load_catalogue
+from sim import dynamics, liquids
+from sim.catalogue import Catalogue, Part, load_catalogue
 from sim.constraints import GraspConstraints
 from sim.metadata import world_metadata
 from sim.objects import STATE_NAMES, ObjectInstance, ObjectPlacement, ObjectState, Placement, copy_state, index_object
@@ -64,6 +66,7 @@ class World:
         objects: every object by id, furniture first.
         rng: the world's random stream, part of snapshots.
         recorder: 20 Hz motion recorder, None without a robot.
+        liquids: where all liquid came from and went to.
 
     Raises:
         WorldError: on unknown ids, states or receptacles, or when an object finds no place.
@@ -97,15 +100,15 @@ class World:
         self.model: mujoco.MjModel = copy.copy(compile_scene(key))
         self.data = mujoco.MjData(self.model)
         self._key = key
+        templates, parts, owners = _indexed(key, (*fixed, *ids), self.catalogue)
         self.objects: dict[str, ObjectInstance] = {
-            name: index_object(self.model, name, self.catalogue) for name in (*fixed, *ids)
+            name: dataclasses.replace(thing, state=ObjectState(), held_by=[]) for name, thing in templates.items()
         }
         self._base_mass = self.model.body_mass.copy()
         self._base_inertia = self.model.body_inertia.copy()
-        self.part_of_geom = {name: self._parts(thing) for name, thing in self.objects.items()}
-        self.object_of_geom = np.full(self.model.ngeom, -1, dtype=np.int64)
-        for index, thing in enumerate(self.objects.values()):
-            self.object_of_geom[thing.geom_ids] = index
+        self._base_geom_pos, self._base_geom_size = self.model.geom_pos.copy(), self.model.geom_size.copy()
+        self.liquids = liquids.Books()
+        self.part_of_geom, self.object_of_geom = parts, owners
         self._movable_body = {body: thing.movable for thing in self.objects.values() for body in thing.body_ids}
         roots = [] if robot is None else [int(self.model.body(robot.root_body).id)]
         self._robot_bodies = frozenset(b for b in range(1, self.model.nbody) if int(self.model.body_rootid[b]) in roots)
@@ -129,21 +132,6 @@ class World:
         self._settle(settle_s)
 
     # ---- building -----------------------------------------------------------------------------------------------------------
-
-    def _parts(self, thing: ObjectInstance) -> list[tuple[int, Part]]:
-        """Visible geoms of an object with the catalogue part each was built from."""
-        sources = {f"{thing.object_id}/{i}": part for i, part in enumerate(thing.type.parts)}
-        for moving in thing.type.moving:
-            sources |= {f"{thing.object_id}/{moving.name}/{i}": part for i, part in enumerate(moving.parts)}
-        found: list[tuple[int, Part]] = []
-        for geom in thing.geom_ids:
-            name = str(self.model.geom(int(geom)).name)
-            if name.endswith("/foot"):
-                continue
-            part = sources.get(name) or sources.get(name.rsplit("/", 1)[0])
-            if part is not None:
-                found.append((int(geom), part))
-        return found
 
     def _reset_robot(
         self,
@@ -288,6 +276,7 @@ class World:
             self.recorder.record(self.data)
         if self.constraints is not None and self.constraints.released:
             self.constraints.settle_released(self._movable_body)
+        liquids.run_out(self, FRAME_DT_S)
         dynamics.break_by_impact(self, self._speeds)
         self._speeds = {name: self.speed_of(name) for name, thing in self.objects.items() if thing.type.has("breakable")}
         if (self._steps // _STEPS_PER_FRAME) % _FRAMES_PER_TICK == 0:
@@ -610,32 +599,69 @@ class World:
         """
         thing = self.object(object_id)
         needs = {"isToggled": "toggleable", "isBroken": "breakable", "isFilledWithLiquid": "fillable", "fillLiquid": "fillable",
-                 "isDirty": "dirtyable", "isCooked": "cookable", "isSliced": "sliceable", "isUsedUp": "used_up"}  # fmt: skip
+                 "fillLitres": "fillable", "isDirty": "dirtyable", "isCooked": "cookable", "isSliced": "sliceable",
+                 "isUsedUp": "used_up"}  # fmt: skip
         if name not in STATE_NAMES:
             raise WorldError(f"unknown state {name!r}; allowed: {', '.join(STATE_NAMES)}")
         linked = object_id in self.room.links.values()
         if name in needs and not thing.type.has(needs[name]) and not (linked and name == "isToggled"):
             raise WorldError(f"{thing.type.name} is not {needs[name]}, {name}={value!r} is not possible")
+        if name in ("isFilledWithLiquid", "fillLiquid", "fillLitres"):
+            self._set_filling(thing, name, value)
+            return
+        if name == "isBroken" and value and thing.state.fillLitres > 0.0:
+            liquids.spill(self, thing)
         setattr(thing.state, name, value)
-        if name == "isFilledWithLiquid":
-            thing.state.fillLiquid = (thing.state.fillLiquid or "water") if value else ""
-        if name == "fillLiquid":
-            thing.state.isFilledWithLiquid = bool(value)
-        if name == "isBroken" and value:
-            thing.state.isFilledWithLiquid, thing.state.fillLiquid = False, ""
-        if "iquid" in name or name == "isBroken":
-            self._update_mass(thing)
         target = self.room.links.get(object_id)
         if name == "isToggled" and target is not None and self.object(target).type.has("heat_source"):
             self.set_state(target, name, value)
         dynamics.look(self, thing)
 
+    def _set_filling(self, thing: ObjectInstance, name: str, value: bool | float | str) -> None:
+        """Fills or empties a vessel by hand; the books take it as given."""
+        before, full = thing.state.fillLitres, liquids.capacity_l(thing.type)
+        liquid = thing.state.fillLiquid or "water"
+        if name == "fillLiquid":
+            if value not in ("", *liquids.LIQUIDS):
+                raise WorldError(f"unknown liquid {value!r}; allowed: {', '.join(liquids.LIQUIDS)}")
+            level, liquid = (before or full) if value else 0.0, str(value)
+        elif name == "fillLitres":
+            level = float(value)
+            if not 0.0 <= level <= full + 1e-9:
+                raise WorldError(f"{thing.object_id} holds 0 to {full:g} litres, got {value!r}")
+        else:
+            level = full if value else 0.0
+        liquids.set_level(self, thing, level, liquid)
+        self.liquids.given += thing.state.fillLitres - before
+
+    def refresh(self, thing: ObjectInstance) -> None:
+        """Brings mass and look of an object in line with its state."""
+        self._update_mass(thing)
+        dynamics.look(self, thing)
+
+    def show_level(self, thing: ObjectInstance, geom: int, part: Part) -> None:
+        """Puts the visible liquid of a vessel at its level: higher in a hollow vessel, wider on a solid one."""
+        full = liquids.capacity_l(thing.type)
+        share = thing.state.fillLitres / full if full > 0.0 else 0.0
+        position, size = self._base_geom_pos[geom], self._base_geom_size[geom]
+        if any(other.wall_m > 0.0 for other in thing.type.parts):
+            floor = max(other.wall_m for other in thing.type.parts) + part.size[2] / 2.0
+            height = min(floor, position[2]) + share * (position[2] - min(floor, position[2]))
+            if height != self.model.geom_pos[geom, 2]:
+                self.move_geom(geom, np.array([position[0], position[1], height]))
+        else:
+            self.model.geom_size[geom, 0] = size[0] * float(np.sqrt(0.3 + 0.7 * share))
+
+    def move_geom(self, geom: int, position: NDArray[np.float64]) -> None:
+        """Moves a geom within its body; MuJoCo does not compute what is fixed to the world again, so that is done here."""
+        body = int(self.model.geom_bodyid[geom])
+        self.model.geom_pos[geom] = position
+        self.data.geom_xpos[geom] = self.data.xpos[body] + self.data.xmat[body].reshape(3, 3) @ position
+
     def liquid_kg(self, object_id: str) -> float:
-        """Kilograms of the liquid in it: about a sixth of its bounding box, at most 2.4 kg."""
+        """Kilograms of the liquid in a movable vessel; furniture does not weigh."""
         thing = self.object(object_id)
-        if not (thing.state.isFilledWithLiquid and thing.movable):
-            return 0.0
-        return float(min(150.0 * np.prod(thing.type.size), 2.4))
+        return thing.state.fillLitres if thing.movable else 0.0
 
     def total_mass_kg(self, object_id: str) -> float:
         """Mass with liquid and contents."""
@@ -716,7 +742,12 @@ class World:
             for name, thing in self.objects.items()
         }
         released = list(self.constraints.released) if self.constraints is not None else []
-        counters = {"steps": self._steps, "speeds": dict(self._speeds), "released": released}
+        counters = {
+            "steps": self._steps,
+            "speeds": dict(self._speeds),
+            "released": released,
+            "liquids": self.liquids.copy(),
+        }
         frames = tuple(self.recorder.frames) if self.recorder is not None else ()
         return WorldSnapshot(
             repr(self._key),
@@ -743,6 +774,7 @@ class World:
             thing.openness, thing.mass_kg = values["openness"], values["mass_kg"]
         self._steps = snapshot.counters["steps"]
         self._speeds = dict(snapshot.counters["speeds"])
+        self.liquids = snapshot.counters["liquids"].copy()
         if self.constraints is not None:
             self.constraints.released = list(snapshot.counters["released"])
         if self.recorder is not None:
@@ -760,6 +792,35 @@ def _scene_key(robot: RobotSpec | None, room: str, ids: Sequence[str]) -> SceneK
         _HANDS[robot.mjcf_path] = tuple(spec.site(robot.arms[side].grasp_site).parent.name for side in SIDES)
     hands = _HANDS[robot.mjcf_path]
     return SceneKey(robot.name, str(robot.mjcf_path), robot.root_body, hands, room, tuple(sorted(ids)))
+
+
+@functools.lru_cache(maxsize=24)
+def _indexed(
+    key: SceneKey, names: tuple[str, ...], catalogue: Catalogue
+) -> tuple[dict[str, ObjectInstance], dict[str, list[tuple[int, Part]]], NDArray[np.int64]]:
+    """What belongs to which object of a compiled scene: objects to be copied, parts by geom, and the object of each geom."""
+    model = compile_scene(key)
+    objects = {name: index_object(model, name, catalogue) for name in names}
+    owners = np.full(model.ngeom, -1, dtype=np.int64)
+    for index, thing in enumerate(objects.values()):
+        owners[thing.geom_ids] = index
+    return objects, {name: _parts(model, thing) for name, thing in objects.items()}, owners
+
+
+def _parts(model: mujoco.MjModel, thing: ObjectInstance) -> list[tuple[int, Part]]:
+    """Visible geoms of an object with the catalogue part each was built from."""
+    sources = {f"{thing.object_id}/{i}": part for i, part in enumerate(thing.type.parts)}
+    for moving in thing.type.moving:
+        sources |= {f"{thing.object_id}/{moving.name}/{i}": part for i, part in enumerate(moving.parts)}
+    found: list[tuple[int, Part]] = []
+    for geom in thing.geom_ids:
+        name = str(model.geom(int(geom)).name)
+        if name.endswith("/foot"):
+            continue
+        part = sources.get(name) or sources.get(name.rsplit("/", 1)[0])
+        if part is not None:
+            found.append((int(geom), part))
+    return found
 
 
 _HANDS: dict[Any, tuple[str, ...]] = {}

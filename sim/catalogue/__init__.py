@@ -1,8 +1,8 @@
 """The catalogue of object types: what exists, how big and heavy it is, what can be done with it, and what it is built from.
 
-Types are data (`object_types.yaml`, and `types/` of one's own assets, see `configs.assets`): a shape is a list of primitives, so a
-new type needs no code. Paper: the DualTHOR asset
-set; dimensions, masses and properties follow AI2-THOR's, the meshes are replaced by primitives.
+Types are data (`object_types.yaml`, and `types/` of one's own assets, see `configs.assets`): a shape is a list of primitives,
+so a new type needs no code. Paper: the DualTHOR asset set; dimensions, masses and properties follow AI2-THOR's, the meshes are
+replaced by primitives.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _VERSION: Final = 1
 SOLIDS: Final = ("box", "cylinder", "cylinder_x", "cylinder_y", "capsule", "capsule_x", "capsule_y", "ellipsoid")
 HOLLOWS: Final = ("tray", "cup", "shell")
 SHAPES: Final = SOLIDS + HOLLOWS
-OPTIONS: Final = ("ghost", "flat", "handle", "toggle", "glow", "hidden", "liquid")
+OPTIONS: Final = ("ghost", "flat", "handle", "toggle", "glow", "hidden", "liquid", "whole", "slice", "spout")
 PROPERTIES: Final = (
     "static",
     "pickupable",
@@ -54,6 +54,8 @@ PROPERTIES: Final = (
     "used_up",
     "heat_source",
     "cold_source",
+    "cutter",
+    "wiper",
 )
 
 
@@ -167,6 +169,7 @@ class ObjectType:
         moving: doors and drawers.
         surfaces: where objects can rest.
         grips: `single` and `double` to preferred hand points in the type's frame, metres.
+        capacity_l: litres of liquid that it holds; None for what the size suggests (`sim.liquids`).
         materials: AI2-THOR's salient materials, subset of `MATERIALS`.
         note: remark from the measurements.
     """
@@ -180,6 +183,7 @@ class ObjectType:
     moving: tuple[MovingSpec, ...] = ()
     surfaces: tuple[SurfaceSpec, ...] = ()
     grips: Mapping[str, tuple[tuple[float, float, float], ...]] = field(default_factory=dict)
+    capacity_l: float | None = None
     materials: tuple[str, ...] = ()
     note: str = ""
 

@@ -1,4 +1,4 @@
-"""What there is to work with: `python -m sim.catalogue [--json]` lists types, rooms, robots, actions, failure codes and cameras.
+"""Lists types, rooms, robots, actions, failure codes and cameras: `python -m sim.catalogue [--json]`.
 
 The user's own assets (`configs.assets`) are included. The JSON has the same entries with every field, and counts.
 """

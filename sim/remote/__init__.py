@@ -3,8 +3,8 @@
     python -m sim.remote                                   # http://127.0.0.1:8265, this machine only
     DUALTHOR_TOKEN=... python -m sim.remote host=0.0.0.0   # elsewhere too; the token is required then
 
-Every client gets a world of its own in a process of its own, so that nothing a client does reaches another. A world that has not
-been asked for a while is closed, and the number of worlds is limited. Requests and replies are JSON:
+Every client gets a world of its own in a process of its own, so that nothing a client does reaches another. A world that has
+not been asked for a while is closed, and the number of worlds is limited. Requests and replies are JSON:
 
 | request | body | reply |
 |---|---|---|
@@ -13,7 +13,8 @@ been asked for a while is closed, and the number of worlds is limited. Requests 
 | `DELETE /worlds/ID` | | `{}` |
 | `GET /health` | | `{"version": 1, "worlds": n, "limit": n}` |
 
-`images` lists what an event carries besides `metadata`: `frame`, `instance_segmentation_frame`, `third_party_camera_frames` (PNG,
-base64) and `depth_frame` (`{"shape", "float32"}`: little-endian metres, base64); by default `["frame"]`. What the Controller refuses
-with ValueError is status 400 with `{"error": message}`. `sim.remote.client.RemoteController` speaks this for Python.
+`images` lists what an event carries besides `metadata`: `frame`, `instance_segmentation_frame`, `third_party_camera_frames`
+(PNG, base64) and `depth_frame` (`{"shape", "float32"}`: little-endian metres, base64); by default `["frame"]`. What the
+Controller refuses with ValueError is status 400 with `{"error": message}`. `sim.remote.client.RemoteController` speaks this for
+Python.
 """

@@ -16,7 +16,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
 from sim.remote.protocol import VERSION, ProtocolError, dumps, images_of, loads
-from sim.remote.worlds import CONTROLLER_ARGUMENTS, WorldGone, WorldRefused, Worlds
+from sim.remote.worlds import CONTROLLER_ARGUMENTS, WorldGoneError, WorldRefusedError, Worlds
 
 __all__ = ["RemoteServer", "ServerConfig", "is_loopback"]
 
@@ -74,7 +74,9 @@ class RemoteServer:
 
     def __init__(self, config: ServerConfig, token: str | None = None) -> None:
         if not is_loopback(config.host) and (token is None or len(token) < 16):
-            raise ValueError(f"host {config.host!r} can be reached from elsewhere: a token of at least 16 characters is required")
+            raise ValueError(
+                f"host {config.host!r} can be reached from elsewhere: a token of at least 16 characters is required"
+            )
         self.config = config
         self.worlds = Worlds(config.worlds, config.idle_s)
         handler = type("Handler", (_Handler,), {"worlds": self.worlds, "token": token, "loopback": is_loopback(config.host)})
@@ -131,7 +133,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         try:
             self.worlds.close(parts[1])
-        except WorldGone as error:
+        except WorldGoneError as error:
             self._fail(HTTPStatus.NOT_FOUND, str(error))
         else:
             self._send(HTTPStatus.OK, {})
@@ -151,9 +153,9 @@ class _Handler(BaseHTTPRequestHandler):
                 self._send(HTTPStatus.OK, {"event": self.worlds.step(parts[1], body, images)})
             else:
                 self._fail(HTTPStatus.NOT_FOUND, f"no {self.path[:80]!r}; allowed: /worlds, /worlds/ID/step")
-        except (ProtocolError, WorldRefused) as error:
+        except (ProtocolError, WorldRefusedError) as error:
             self._fail(HTTPStatus.BAD_REQUEST, str(error))
-        except WorldGone as error:
+        except WorldGoneError as error:
             self._fail(HTTPStatus.NOT_FOUND, str(error))
         except OverflowError as error:
             self._fail(HTTPStatus.SERVICE_UNAVAILABLE, str(error))

@@ -1,7 +1,7 @@
 """Worlds of a server: one process per world, asked through a pipe, closed when idle.
 
-A process of its own isolates a world's physics, OpenGL context and crashes from all others. A world answers one request at a time;
-requests to different worlds run at once.
+A process of its own isolates a world's physics, OpenGL context and crashes from all others. A world answers one request at a
+time; requests to different worlds run at once.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 
 from data.workers import start_worker
 
-__all__ = ["Worlds", "WorldGone", "WorldRefused"]
+__all__ = ["WorldGoneError", "WorldRefusedError", "Worlds"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -29,11 +29,11 @@ CONTROLLER_ARGUMENTS = (
 )  # fmt: skip
 
 
-class WorldRefused(ValueError):
+class WorldRefusedError(ValueError):
     """What the Controller refused with ValueError."""
 
 
-class WorldGone(LookupError):
+class WorldGoneError(LookupError):
     """There is no such world: never opened, closed, expired, or its process died."""
 
 
@@ -93,7 +93,7 @@ class Worlds:
         """Starts a world; returns its secret id and the first event.
 
         Raises:
-            WorldRefused: when the Controller refuses the arguments.
+            WorldRefusedError: when the Controller refuses the arguments.
             OverflowError: when there are as many worlds as are allowed.
         """
         with self._lock:
@@ -126,12 +126,12 @@ class Worlds:
         """One call of a world's Controller.
 
         Raises:
-            WorldGone: when there is no such world, or it died meanwhile.
-            WorldRefused: when the Controller refuses the call.
+            WorldGoneError: when there is no such world, or it died meanwhile.
+            WorldRefusedError: when the Controller refuses the call.
         """
         world = self._worlds.get(name)
         if world is None:
-            raise WorldGone("no such world; it may have been idle for too long")
+            raise WorldGoneError("no such world; it may have been idle for too long")
         with world.lock:
             world.used_s = time.monotonic()
             try:
@@ -139,7 +139,7 @@ class Worlds:
                 return self._answer(world)
             except (EOFError, OSError):
                 self.close(name)
-                raise WorldGone("the world's process has died") from None
+                raise WorldGoneError("the world's process has died") from None
             finally:
                 world.used_s = time.monotonic()
 
@@ -147,12 +147,12 @@ class Worlds:
         """Ends a world.
 
         Raises:
-            WorldGone: when there is no such world.
+            WorldGoneError: when there is no such world.
         """
         with self._lock:
             world = self._worlds.pop(name, None)
         if world is None:
-            raise WorldGone("no such world")
+            raise WorldGoneError("no such world")
         _end(world)
 
     def stop(self) -> None:
@@ -161,7 +161,7 @@ class Worlds:
         for name in list(self._worlds):
             try:
                 self.close(name)
-            except WorldGone:
+            except WorldGoneError:
                 continue
 
     def _answer(self, world: _World) -> dict[str, Any]:
@@ -170,7 +170,7 @@ class Worlds:
             raise EOFError
         kind, value = world.pipe.recv()
         if kind == "refused":
-            raise WorldRefused(value)
+            raise WorldRefusedError(value)
         return value
 
     def _reap(self) -> None:
@@ -182,7 +182,7 @@ class Worlds:
                 try:
                     self.close(name)
                     _LOG.info("a world was idle for %.0f s and is closed", now - world.used_s)
-                except WorldGone:
+                except WorldGoneError:
                     continue
                 finally:
                     world.lock.release()

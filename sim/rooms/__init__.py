@@ -1,7 +1,7 @@
 """Rooms as data: floor, walls, furniture poses, wiring, and the objects that lie around by default.
 
-One YAML file per room in this folder, or in `rooms/` of one's own assets (`configs.assets`). World frame: x and y in metres on the floor, z up, origin at the centre of the floor.
-Paper: the DualTHOR scenes (kitchen, living room, bedroom, bathroom).
+One YAML file per room in this folder, or in `rooms/` of one's own assets (`configs.assets`). World frame: x and y in metres on
+the floor, z up, origin at the centre of the floor. Paper: the DualTHOR scenes (kitchen, living room, bedroom, bathroom).
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from data.records import Action, Arm
 from sim.failures import FailureCode, SkillFailure
 from sim.navigation import Stance
-from sim.objects import MovingPart
+from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
@@ -29,10 +29,12 @@ from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.trajectory import min_jerk
 
-__all__ = ["assess_open_close", "assess_toggle", "open_close", "toggle"]
+__all__ = ["assess_open_close", "assess_toggle", "open_close", "plan_handle", "plan_press", "toggle"]
 
 Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
+#: The fingertips reach this far past the bar of a handle.
+_PAST_BAR_M: Final = 0.025
 _SPEED: Final = 0.45
 #: Share of the joint's range that Open leads the door to, and least share that counts as done.
 _OPEN_TO: Final = 0.95
@@ -98,7 +100,7 @@ def assess_open_close(body: Body, action: Action) -> Pull:
     low, high = part.range
     goal = low + (_OPEN_TO if opening else -0.04) * (high - low)  # shut means pushed against the stop
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
-    grip_m = body.spec.hand.tip_m - 0.025  # the fingertips reach a little past the bar
+    grip_m = body.spec.hand.tip_m - _PAST_BAR_M
 
     def search() -> Pull:
         best: Pull | None = None
@@ -117,6 +119,29 @@ def assess_open_close(body: Body, action: Action) -> Pull:
         if best is None:
             raise SkillFailure(FailureCode.OBSTRUCTED)
         return best
+
+    try:
+        return search()
+    except SkillFailure:
+        raise blame(body, {arm: handle}, search) from None
+
+
+def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
+    """How the open hand comes to the handle of a door or drawer.
+
+    Raises:
+        SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
+    """
+    handle = body.world.handle(thing.object_id)
+    bar = tuple(map(int, body.part_geoms(thing, "handle")))
+    grip_m = body.spec.hand.tip_m - _PAST_BAR_M
+
+    def search() -> Reach:
+        for pointing in _pointings(body, arm, handle):
+            reach = plan_reach(body, arm, HandPose(handle - grip_m * pointing, pointing), -pointing, 0.08, bar, pointing=0.7)
+            if reach is not None:
+                return reach
+        raise SkillFailure(FailureCode.OBSTRUCTED)
 
     try:
         return search()
@@ -260,20 +285,26 @@ def assess_toggle(body: Body, action: Action) -> Reach:
     assert action.arm is not None and action.object_id is not None
     arm, thing = action.arm, body.thing(action.object_id)
     check_toggle(body, arm, thing, action.name == "ToggleOn")
-    switch = body.world.toggle_point(thing.object_id)
+    return plan_press(body, arm, body.world.toggle_point(thing.object_id), (thing.object_id,))
+
+
+def plan_press(body: Body, arm: Arm, point: Array, ignore: tuple[str, ...]) -> Reach:
+    """How a fingertip of the empty hand comes to a point (3,) in the world.
+
+    Raises:
+        SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
+    """
     ahead, aside, opening = body.spec.hand.press
 
     def search() -> Reach:
-        for pointing in _pointings(body, arm, switch):
-            first = body.solve(arm, HandPose(switch - ahead * pointing, pointing))
+        for pointing in _pointings(body, arm, point):
+            first = body.solve(arm, HandPose(point - ahead * pointing, pointing))
             if not fulfils(first, pointing=0.8):
                 continue
             # the fingertip, as the hand will really be turned, belongs on the switch
-            site = switch - ahead * first.pointing - aside * first.closing
+            site = point - ahead * first.pointing - aside * first.closing
             wish = HandPose(site, first.pointing, first.closing)
-            reach = plan_reach(
-                body, arm, wish, -first.pointing, 0.07, (thing.object_id,), 0.95, 0.9, opening=opening, start=first.q
-            )
+            reach = plan_reach(body, arm, wish, -first.pointing, 0.07, ignore, 0.95, 0.9, opening=opening, start=first.q)
             if reach is not None:
                 return reach
         raise SkillFailure(FailureCode.OBSTRUCTED)
@@ -281,7 +312,7 @@ def assess_toggle(body: Body, action: Action) -> Reach:
     try:
         return search()
     except SkillFailure:
-        raise blame(body, {arm: switch}, search) from None
+        raise blame(body, {arm: point}, search) from None
 
 
 def toggle(body: Body, action: Action, luck: Luck) -> Skill:

@@ -208,6 +208,8 @@ class Body:
             return self.held[action.arm] or action.object_id or ""
         if action.name == "PlaceBoth":
             return self.lifted or action.object_id or ""
+        if action.name in ("Pour", "Fill") and action.arm is not None:
+            return self.held[action.arm] or action.object_id or ""
         return action.object_id or ""
 
     def solid_geoms(self, thing: ObjectInstance) -> NDArray[np.int64]:

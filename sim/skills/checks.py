@@ -8,10 +8,24 @@ from __future__ import annotations
 
 from data.records import Arm
 from sim.failures import FailureCode, SkillFailure
+from sim.liquids import capacity_l, spout
 from sim.objects import ObjectInstance
 from sim.skills.body import Body
 
-__all__ = ["check_lift", "check_open_close", "check_pick", "check_place", "check_place_both", "check_toggle"]
+__all__ = [
+    "check_clean",
+    "check_fill",
+    "check_hold",
+    "check_lift",
+    "check_open_close",
+    "check_pick",
+    "check_place",
+    "check_place_both",
+    "check_pour",
+    "check_slice",
+    "check_toggle",
+    "check_use_up",
+]
 
 
 def _check_accessible(body: Body, thing: ObjectInstance) -> None:
@@ -90,6 +104,104 @@ def check_toggle(body: Body, arm: Arm, thing: ObjectInstance, on: bool) -> None:
         raise SkillFailure(FailureCode.ALREADY_IN_STATE)
     if thing.is_broken:
         raise SkillFailure(FailureCode.OBJECT_BROKEN)
+
+
+def _held(body: Body, arm: Arm) -> ObjectInstance:
+    """What an arm alone holds and can use."""
+    if body.lifted is not None:
+        raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
+    name = body.held[arm]
+    if name is None:
+        raise SkillFailure(FailureCode.HAND_EMPTY)
+    return body.thing(name)
+
+
+def check_hold(body: Body, arm: Arm, thing: ObjectInstance) -> None:
+    """Preconditions of Hold."""
+    if thing.movable:
+        check_pick(body, arm, thing)
+        return
+    _check_free_hand(body, arm)
+    if not thing.moving:
+        raise SkillFailure(FailureCode.NOT_PICKUPABLE)
+    if thing.held_by:
+        raise SkillFailure(FailureCode.ALREADY_HELD)
+
+
+def check_slice(body: Body, arm: Arm, thing: ObjectInstance) -> ObjectInstance:
+    """Preconditions of Slice; returns the knife."""
+    tool = _held(body, arm)
+    if not tool.type.has("cutter"):
+        raise SkillFailure(FailureCode.NEEDS_TOOL)
+    if not thing.type.has("sliceable"):
+        raise SkillFailure(FailureCode.NOT_SLICEABLE)
+    if thing.state.isSliced:
+        raise SkillFailure(FailureCode.ALREADY_IN_STATE)
+    if arm.value in thing.held_by:
+        raise SkillFailure(FailureCode.IN_USE)
+    _check_accessible(body, thing)
+    return tool
+
+
+def check_clean(body: Body, arm: Arm, thing: ObjectInstance) -> ObjectInstance:
+    """Preconditions of Clean; returns the sponge or towel."""
+    tool = _held(body, arm)
+    if not tool.type.has("wiper"):
+        raise SkillFailure(FailureCode.NEEDS_TOOL)
+    spilled = any(puddle.surface == thing.object_id for puddle in body.world.liquids.puddles)
+    if not thing.state.isDirty and not spilled:
+        raise SkillFailure(FailureCode.NOT_DIRTY)
+    if thing is tool:
+        raise SkillFailure(FailureCode.IN_USE)
+    _check_accessible(body, thing)
+    return tool
+
+
+def check_use_up(body: Body, arm: Arm, thing: ObjectInstance) -> None:
+    """Preconditions of UseUp."""
+    _check_free_hand(body, arm)
+    if not thing.type.has("used_up"):
+        raise SkillFailure(FailureCode.NOT_USABLE)
+    if thing.state.isUsedUp:
+        raise SkillFailure(FailureCode.ALREADY_IN_STATE)
+    _check_accessible(body, thing)
+
+
+def check_pour(body: Body, arm: Arm, target: ObjectInstance) -> ObjectInstance:
+    """Preconditions of Pour; returns the vessel that is poured from."""
+    vessel = _held(body, arm)
+    if not (vessel.movable and vessel.type.fillable):
+        raise SkillFailure(FailureCode.NEEDS_TOOL)
+    if vessel.state.fillLitres <= 0.0:
+        raise SkillFailure(FailureCode.EMPTY)
+    if not target.type.fillable or target is vessel:
+        raise SkillFailure(FailureCode.NOT_FILLABLE)
+    if target.is_broken:
+        raise SkillFailure(FailureCode.OBJECT_BROKEN)
+    if arm.other.value in target.held_by:
+        raise SkillFailure(FailureCode.IN_USE)
+    if target.state.fillLitres >= 0.999 * capacity_l(target.type):
+        raise SkillFailure(FailureCode.ALREADY_IN_STATE)
+    _check_accessible(body, target)
+    return vessel
+
+
+def check_fill(body: Body, arm: Arm, source: ObjectInstance) -> tuple[ObjectInstance, ObjectInstance]:
+    """Preconditions of Fill; returns the vessel and what the liquid comes out of: a tap for its basin, or the source itself."""
+    vessel = _held(body, arm)
+    if not (vessel.movable and vessel.type.fillable):
+        raise SkillFailure(FailureCode.NEEDS_TOOL)
+    if vessel.is_broken:
+        raise SkillFailure(FailureCode.OBJECT_BROKEN)
+    if vessel.state.fillLitres >= 0.999 * capacity_l(vessel.type):
+        raise SkillFailure(FailureCode.ALREADY_IN_STATE)
+    taps = [name for name, basin in body.world.room.links.items() if basin == source.object_id]
+    outlet = body.thing(taps[0]) if taps and spout(body.world, source) is None else source
+    if spout(body.world, outlet) is None:
+        raise SkillFailure(FailureCode.NOT_FILLABLE)
+    if not outlet.is_toggled:
+        raise SkillFailure(FailureCode.SOURCE_OFF)
+    return vessel, outlet
 
 
 def check_lift(body: Body, thing: ObjectInstance) -> None:

@@ -9,7 +9,7 @@ Paper: Pick and Place of the DualTHOR action space, there without contact.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from data.records import Action, Arm
 from sim.failures import FailureCode, SkillFailure
+from sim.liquids import spill
 from sim.objects import ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_pick, check_place
@@ -26,7 +27,7 @@ from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
 
-__all__ = ["Luck", "pick", "place", "plan_pick", "plan_place", "reset_arm", "stow"]
+__all__ = ["Luck", "grip", "nudge", "pick", "place", "plan_bring", "plan_pick", "plan_place", "reset_arm", "retreat", "stow"]
 
 Array = NDArray[np.float64]
 
@@ -37,6 +38,10 @@ GRASP_GAP_M: Final = 0.015
 _APPROACH_M: Final = 0.09
 _LIFT_M: Final = 0.06
 _MAX_PLANS: Final = 60
+#: Share of the usual speed at which liquids are carried.
+_CARE: Final = 0.6
+#: A vessel with a liquid counts as upright below this tilt.
+_LEVEL_RAD: Final = float(np.radians(25.0))
 _UP: Final = np.array([0.0, 0.0, 1.0])
 
 
@@ -89,13 +94,19 @@ def stow(body: Body, arm: Arm, ignore: tuple[str | int, ...] = ()) -> Skill:
     """Brings the arm to its ready posture, or to the carrying one with something in the hand, around what is in the way."""
     held = body.held[arm]
     goal = body.ready(arm) if held is None or not body.thing(held).movable else _carry(body, arm, held)
+    if held is not None and body.thing(held).state.fillLitres > 0.0:
+        yield from body.move_arm(arm, [*_level_way(body, arm, held, goal), goal], speed=_CARE)
+        return
     way = route(body, arm, body.commanded_arm(arm), goal, ignore)
     vias = way if way is not None else tuple(body.vias(arm))[:1]
     yield from body.move_arm(arm, [*vias, goal])
 
 
 def _carry(body: Body, arm: Arm, held: str) -> Array:
-    """(A,) carrying posture with the hand turned so that the object stands as upright as the arm can hold it."""
+    """(A,) carrying posture with the hand turned so that the object stands as upright as the arm can hold it.
+
+    What holds a liquid is carried where the arm holds it upright, which may be farther ahead.
+    """
     usual = body.carrying(arm)
     _, hand = body.hand_pose(arm)
     turn = _upright(body.world.pose(held)[:3, :3])
@@ -106,7 +117,55 @@ def _carry(body: Body, arm: Arm, held: str) -> Array:
         pointing, closing = about @ pointing, about @ closing
     place_at = body.hand_at(arm, usual)
     solved = body.solve(arm, HandPose(place_at, pointing, closing), start=usual, roll_weight=0.2)
+    if body.thing(held).state.fillLitres > 0.0:
+        up = hand.T @ body.world.pose(held)[:3, 2]
+        return _level(body, arm, up, place_at, pointing, closing, solved.q if solved.error_m < 0.05 else usual)
     return solved.q if solved.error_m < 0.05 else usual
+
+
+def _level_way(body: Body, arm: Arm, held: str, goal: Array) -> list[Array]:
+    """(A,) postures on the hand's straight way to carrying on which a vessel stays upright, as far as they exist."""
+    start, end = body.hand_pose(arm)[0], body.hand_at(arm, goal)
+    hand = body.hand_pose(arm)[1]
+    turn = _upright(body.world.pose(held)[:3, :3])
+    pointing, closing = turn @ hand[:, 0], turn @ hand[:, 1]
+    way: list[Array] = []
+    last = body.commanded_arm(arm)
+    for share in (0.25, 0.5, 0.75):
+        solved = body.solve(arm, HandPose(start + share * (end - start), pointing, closing), start=last, roll_weight=0.2)
+        if solved.error_m < 0.05 and body.probe.free(arm, [solved.q]):
+            last = solved.q
+            way.append(last)
+    return way
+
+
+def nudge(body: Body, arm: Arm, change: Array) -> Skill:
+    """Moves the hand by a small way in the world, as far as the arm can."""
+    position, hand = body.hand_pose(arm)
+    goal = body.solve(arm, HandPose(position + change, hand[:, 0], hand[:, 1]), start=body.commanded_arm(arm))
+    if goal.error_m < 0.03:
+        yield from body.move_arm(arm, [goal.q], speed=0.6)
+
+
+def _level(body: Body, arm: Arm, up: Array, near: Array, pointing: Array, closing: Array, otherwise: Array) -> Array:
+    """(A,) posture around a point in which an object whose axis is `up` in the hand stands upright, or most nearly so."""
+    best: tuple[float, Array] | None = None
+    ahead, left = body.turn_to_world(np.array([1.0, 0.0, 0.0])), body.turn_to_world(np.array([0.0, 1.0, 0.0]))
+    outward = left if arm is Arm.LEFT else -left
+    for forward in (0.0, 0.08, 0.16):
+        for rise in (0.0, -0.1, 0.1, -0.2):
+            for aside in (0.0, 0.08):
+                point = near + forward * ahead + aside * outward + rise * _UP
+                goal = body.solve(arm, HandPose(point, pointing, closing), roll_weight=0.2)
+                axes = np.stack([goal.pointing, goal.closing, np.cross(goal.pointing, goal.closing)], axis=1)
+                tilt = float(np.arccos(np.clip((axes @ up)[2], -1.0, 1.0)))
+                if goal.error_m > 0.05 or not body.probe.free(arm, [goal.q]):
+                    continue
+                if best is None or tilt < best[0] - 0.02:
+                    best = (tilt, goal.q)
+                if tilt < _LEVEL_RAD:
+                    return goal.q
+    return otherwise if best is None else best[1]
 
 
 def _close(body: Body, arm: Arm, geoms: NDArray[np.int64]) -> Skill:
@@ -121,7 +180,7 @@ def _close(body: Body, arm: Arm, geoms: NDArray[np.int64]) -> Skill:
     yield from wait(0.1)
 
 
-def _retreat(body: Body, arm: Arm, reach: Reach, ignore: tuple[str | int, ...]) -> Skill:
+def retreat(body: Body, arm: Arm, reach: Reach, ignore: tuple[str | int, ...]) -> Skill:
     """Opens the hand, backs off along the approach and stows the arm."""
     yield from body.move_hand(arm, 1.0)
     yield from body.move_arm(arm, [reach.before])
@@ -140,7 +199,7 @@ def pick(body: Body, action: Action, luck: Luck) -> Skill:
     thing = body.thing(action.object_id)
     name = (thing.object_id,)
     geoms = body.solid_geoms(thing)
-    yield from _grip(body, arm, grasp, reach, geoms)
+    yield from grip(body, arm, grasp, reach, geoms)
     gaps = body.probe.finger_gaps_m(arm, geoms)
     if max(gaps) > GRASP_GAP_M:  # look again and try another way once
         yield from body.move_hand(arm, 1.0, 0.2)
@@ -148,13 +207,13 @@ def pick(body: Body, action: Action, luck: Luck) -> Skill:
         again = _find_grasp(body, arm, thing, _MAX_PLANS, avoid=grasp)
         if again is not None:
             grasp, reach = again
-            yield from _grip(body, arm, grasp, reach, geoms)
+            yield from grip(body, arm, grasp, reach, geoms)
             gaps = body.probe.finger_gaps_m(arm, geoms)
     if max(gaps) > GRASP_GAP_M:
-        yield from _retreat(body, arm, reach, name)
+        yield from retreat(body, arm, reach, name)
         raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": max(gaps)})
     if thing.held_by:
-        yield from _retreat(body, arm, reach, name)
+        yield from retreat(body, arm, reach, name)
         raise SkillFailure(FailureCode.ALREADY_HELD)
     outcome = luck(action)
     body.world.attach(arm.value, thing.object_id)
@@ -166,7 +225,7 @@ def pick(body: Body, action: Action, luck: Luck) -> Skill:
         raise SkillFailure(FailureCode.DROPPED)
 
 
-def _grip(body: Body, arm: Arm, grasp: Grasp, reach: Reach, geoms: NDArray[np.int64]) -> Skill:
+def grip(body: Body, arm: Arm, grasp: Grasp, reach: Reach, geoms: NDArray[np.int64]) -> Skill:
     """Moves the open hand to the object and closes it."""
     yield from body.move_hand(arm, grasp.opening, 0.2)
     yield from body.move_arm(arm, [*reach.way, reach.before])
@@ -190,8 +249,8 @@ def _bad_luck(body: Body, arm: Arm, thing: ObjectInstance, outcome: str) -> Skil
     codes = {"slipped": FailureCode.SLIPPED, "spilled": FailureCode.SPILLED, "broken": FailureCode.BROKE}
     code = codes.get(outcome, FailureCode.NOTHING_HAPPENED)
     body.world.detach(arm.value)
-    if outcome in ("spilled", "broken") and thing.type.fillable:
-        body.world.set_state(thing.object_id, "isFilledWithLiquid", False)
+    if outcome in ("spilled", "broken"):
+        spill(body.world, thing)
     if outcome == "broken" and thing.type.has("breakable"):
         body.world.set_state(thing.object_id, "isBroken", True)
     yield from body.move_hand(arm, 1.0)
@@ -209,19 +268,52 @@ def plan_place(body: Body, arm: Arm, thing: ObjectInstance, receptacle: ObjectIn
     Raises:
         SkillFailure: ReceptacleFull, TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
-    world = body.world
-    position, hand = body.hand_pose(arm)
-    pose = world.pose(thing.object_id)
-    # the object upright again, turned about the vertical only
-    tilt = _upright(pose[:3, :3])
-    offset = tilt @ (pose[:3, 3] - position)  # object frame from the hand
-    pointing, closing = tilt @ hand[:, 0], tilt @ hand[:, 1]
-    lowest = _lowest(thing, tilt @ pose[:3, :3])
-    shoulder = body.shoulder(arm)
     spots = body.free_spots(thing, receptacle, arm)
     if not spots:
         raise SkillFailure(FailureCode.RECEPTACLE_FULL)
-    lift = np.array([0.0, 0.0, 0.006 - lowest])
+    return plan_bring(body, arm, thing, spots, (thing.object_id, receptacle.object_id))
+
+
+def plan_bring(
+    body: Body,
+    arm: Arm,
+    thing: ObjectInstance,
+    spots: Sequence[Array],
+    ignore: Sequence[str],
+    point: Array | None = None,
+    above_m: float = 0.006,
+    coming_from: Array = _UP,
+) -> tuple[Array, Reach, Array]:
+    """How the arm brings what it holds, upright, to one of some spots.
+
+    Args:
+        body: the robot.
+        arm: the arm that holds it.
+        thing: what it holds.
+        spots: (3,) world points, the best first.
+        ignore: ids that may be touched at the spot.
+        point: (3,) point of the object that belongs above the spot, in its own frame; its frame's origin when None.
+        above_m: height of the object's lowest point above the spot.
+        coming_from: (3,) unit direction from the spot back to where the last straight way starts.
+
+    Returns:
+        The spot, the motion, and the direction in which the hand leaves.
+
+    Raises:
+        SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
+    """
+    position, hand = body.hand_pose(arm)
+    pose = body.world.pose(thing.object_id)
+    # the object upright again, turned about the vertical only
+    tilt = _upright(pose[:3, :3])
+    middle = pose[:3, 3] if point is None else pose[:3, 3] + pose[:3, :3] @ point
+    offset = tilt @ (middle - position)  # object frame from the hand
+    pointing, closing = tilt @ hand[:, 0], tilt @ hand[:, 1]
+    lowest = _lowest(thing, tilt @ pose[:3, :3])
+    if point is not None:
+        lowest -= float((tilt @ pose[:3, :3] @ point)[2])
+    shoulder = body.shoulder(arm)
+    lift = np.array([0.0, 0.0, above_m - lowest])
 
     def search() -> tuple[Array, Reach, Array]:
         for spot in spots:
@@ -232,9 +324,7 @@ def plan_place(body: Body, arm: Arm, thing: ObjectInstance, receptacle: ObjectIn
             for extra in (0.0, 0.35, -0.35, 0.75, -0.75):
                 turn = _turn_z(straight + extra)
                 wish = HandPose(spot + lift - turn @ offset, turn @ pointing, turn @ closing)
-                reach = plan_reach(
-                    body, arm, wish, _UP, 0.08, (thing.object_id, receptacle.object_id), pointing=0.9, closing=0.93
-                )
+                reach = plan_reach(body, arm, wish, coming_from, 0.08, ignore, pointing=0.9, closing=0.93)
                 if reach is not None:
                     return spot, reach, -(turn @ pointing)
         raise SkillFailure(FailureCode.OBSTRUCTED)
@@ -251,7 +341,7 @@ def place(body: Body, action: Action, luck: Luck) -> Skill:
     Raises:
         SkillFailure: what `check_place` and `plan_place` refuse, PlaceMissed, or a contingency.
     """
-    _, reach, retreat = assess_place(body, action)
+    _, reach, away = assess_place(body, action)
     arm = action.arm
     assert arm is not None and action.object_id is not None
     receptacle, thing = body.thing(action.object_id), body.thing(body.held[arm] or "")
@@ -259,8 +349,8 @@ def place(body: Body, action: Action, luck: Luck) -> Skill:
     name = (thing.object_id,)
     yield from body.move_arm(arm, [*reach.way, reach.before])
     if outcome in ("nothing", "spilled"):
-        if outcome == "spilled" and thing.type.fillable:
-            body.world.set_state(thing.object_id, "isFilledWithLiquid", False)
+        if outcome == "spilled":
+            spill(body.world, thing)
         yield from stow(body, arm, name)
         raise SkillFailure(FailureCode.SPILLED if outcome == "spilled" else FailureCode.NOTHING_HAPPENED, contingency=outcome)
     lowering = body.move_arm(arm, [reach.at], speed=0.6)
@@ -274,7 +364,7 @@ def place(body: Body, action: Action, luck: Luck) -> Skill:
     body.world.detach(arm.value)
     yield from body.move_hand(arm, 1.0)
     position, hand = body.hand_pose(arm)
-    back = body.solve(arm, HandPose(position + 0.09 * retreat, hand[:, 0], hand[:, 1]), start=body.commanded_arm(arm))
+    back = body.solve(arm, HandPose(position + 0.09 * away, hand[:, 0], hand[:, 1]), start=body.commanded_arm(arm))
     yield from body.move_arm(arm, [back.q if back.error_m < 0.03 else reach.before])
     yield from stow(body, arm)
     for _ in range(int(1.0 / CONTROL_DT_S)):

@@ -7,7 +7,7 @@ from typing import Final
 
 from data.records import Action, PlanStep
 from sim.failures import FailureCode, SkillFailure
-from sim.skills import articulate, locomotion, manipulate, two_arm
+from sim.skills import articulate, holding, locomotion, manipulate, pouring, tools, two_arm
 from sim.skills.body import Body
 from sim.skills.manipulate import Luck
 from sim.skills.runner import Skill, refuse
@@ -36,6 +36,13 @@ ARM_SKILLS: Final[Mapping[str, Callable[[Body, Action, Luck], Skill]]] = {
     "Close": articulate.open_close,
     "ToggleOn": articulate.toggle,
     "ToggleOff": articulate.toggle,
+    "Hold": holding.hold,
+    "Release": holding.release,
+    "Slice": tools.slice_object,
+    "Clean": tools.clean,
+    "UseUp": tools.use_up,
+    "Pour": pouring.pour,
+    "Fill": pouring.fill,
     "Lift": two_arm.lift,
     "PlaceBoth": two_arm.place_both,
 }
@@ -50,11 +57,18 @@ def skills_for(body: Body, step: PlanStep, known: frozenset[str], luck: Luck) ->
             skills.append((action, refuse(FailureCode.ARM_CONFLICT)))
         elif action.object_id is not None and action.object_id not in known:
             skills.append((action, refuse(FailureCode.OBJECT_NOT_KNOWN)))
+        elif action.name in BODY_SKILLS and _holds_furniture(body) and action.name not in ("MoveUp", "MoveDown"):
+            skills.append((action, refuse(FailureCode.IN_USE)))
         elif action.name in BODY_SKILLS:
             skills.append((action, BODY_SKILLS[action.name](body, action)))
         else:
             skills.append((action, ARM_SKILLS[action.name](body, action, luck)))
     return skills
+
+
+def _holds_furniture(body: Body) -> bool:
+    """Whether a hand is at a door or drawer, which walking would tear at."""
+    return any(name is not None and not body.thing(name).movable for name in body.held.values())
 
 
 def _conflict(step: PlanStep) -> bool:
@@ -63,6 +77,8 @@ def _conflict(step: PlanStep) -> bool:
         return False
     first, second = step.actions
     same = first.object_id is not None and first.object_id == second.object_id
+    if {first.name, second.name} & {"Hold"} and {first.name, second.name} & {"Slice", "Clean", "Pour"}:
+        return False
     return same and not (first.name == second.name == "Place")
 
 
@@ -77,6 +93,12 @@ def assess_action(body: Body, action: Action, known: frozenset[str]) -> SkillFai
         "Close": articulate.assess_open_close,
         "ToggleOn": articulate.assess_toggle,
         "ToggleOff": articulate.assess_toggle,
+        "Hold": holding.assess_hold,
+        "Slice": tools.assess_slice,
+        "Clean": tools.assess_clean,
+        "UseUp": tools.assess_use_up,
+        "Pour": pouring.assess_pour,
+        "Fill": pouring.assess_fill,
         "Lift": two_arm.assess_lift,
         "PlaceBoth": two_arm.assess_place_both,
     }

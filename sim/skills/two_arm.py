@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from data.records import Action, Arm
 from sim.failures import FailureCode, SkillFailure
+from sim.liquids import spill
 from sim.objects import ObjectInstance
 from sim.skills.body import Body, BothGoal, wait
 from sim.skills.checks import check_lift, check_place_both
@@ -146,8 +147,8 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
     if outcome != "success":
         for arm in Arm:
             body.world.detach(arm.value)
-        if outcome == "spilled" and thing.type.fillable:
-            body.world.set_state(thing.object_id, "isFilledWithLiquid", False)
+        if outcome == "spilled":
+            spill(body.world, thing)
         yield from body.move_both([reach.before])
         yield from body.stow_both()
         code = FailureCode.SPILLED if outcome == "spilled" else FailureCode.SLIPPED

@@ -2,10 +2,12 @@
 
 from collections import Counter
 
+import numpy as np
 import pytest
+from scipy.stats import chisquare
 
 from configs.validate import ConfigError, build
-from sim.contingency import DIFFICULTIES, Contingency, ContingencyConfig, load_contingency
+from sim.contingency import DIFFICULTIES, Contingency, ContingencyConfig, OutcomeRule, load_contingency
 
 FILLED = {"isFilledWithLiquid": True}
 CONFIG = load_contingency()
@@ -71,3 +73,16 @@ def test_bad_difficulties_are_refused():
         build(ContingencyConfig, {"difficulties": {"easy": 1.0}, "rules": []})
     with pytest.raises(ConfigError, match=r"must lie in \[0, 1\], got 2"):
         build(ContingencyConfig, {"difficulties": dict.fromkeys(DIFFICULTIES, 2.0), "rules": []})
+
+
+@pytest.mark.parametrize(
+    "rule", CONFIG.rules, ids=lambda rule: f"{'+'.join(rule.actions)}-{rule.types[0] if rule.types else 'any'}"
+)
+def test_observed_frequencies_match_the_file(rule: OutcomeRule) -> None:
+    """Chi-square over 4,000 draws per rule; the seeds are fixed, so this either holds or it does not."""
+    luck = Contingency(CONFIG, "natural", 5)
+    kind = rule.types[0] if rule.types else "Zebra"
+    draws = [luck.draw(step, rule.actions[0], f"{kind}_1", kind, dict(rule.state)) for step in range(4000)]
+    counts = np.array([draws.count(name) for name in rule.outcomes])
+    assert counts.sum() == len(draws)
+    assert chisquare(counts, len(draws) * np.array(list(rule.outcomes.values()))).pvalue > 0.001

@@ -51,7 +51,16 @@ def test_reply_has_dualthors_fields(controller: Controller) -> None:
     assert set(reply) == {"success", "imgpath", "msg", "sceneState"}
     state = reply["sceneState"]
     assert set(state) == {"id", "objects", "agent", "reachablePositions"}
-    assert {"name", "position", "rotation", "lastAction", "lastActionSuccess", "errorMessage", "jointAngles", "gripperAngles"} == set(state["agent"])
+    assert {
+        "name",
+        "position",
+        "rotation",
+        "lastAction",
+        "lastActionSuccess",
+        "errorMessage",
+        "jointAngles",
+        "gripperAngles",
+    } == set(state["agent"])
     toilet = next(item for item in state["objects"] if item["objectId"] == "Bathroom_Toilet_01")
     assert toilet["receptacleObjectIds"] == ["Bathroom_ToiletPaper_01"] and "isMoveable" in toilet
 
@@ -61,7 +70,10 @@ def test_two_actions_reply_per_arm(controller: Controller) -> None:
     pair = [{"action": "resetjoint", "arm": "left"}, {"action": "place", "arm": "right", "container": "Bathroom_CounterTop_01"}]
     reply = controller.step({"actions": pair, "executionMode": "parallel"})
     assert "msg" not in reply and not reply["success"]
-    assert [(r["arm"], r["action"], r["success"]) for r in reply["results"]] == [("left", "resetarm", True), ("right", "place", False)]
+    assert [(r["arm"], r["action"], r["success"]) for r in reply["results"]] == [
+        ("left", "resetarm", True),
+        ("right", "place", False),
+    ]
 
 
 def test_states_can_be_gone_back_to(controller: Controller) -> None:

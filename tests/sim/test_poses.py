@@ -86,7 +86,10 @@ def test_random_spawn_is_seeded_and_everything_rests(controller: Controller) -> 
 
 def test_random_spawn_leaves_out_what_is_excluded() -> None:
     rng = np.random.default_rng(0)
-    placed = {p.object_id: p.receptacle for p in random_placements("kitchen_1", rng, excluded_receptacles=["CounterTop", "Shelf_1"], excluded_objects=["Pot"])}
+    placed = {
+        p.object_id: p.receptacle
+        for p in random_placements("kitchen_1", rng, excluded_receptacles=["CounterTop", "Shelf_1"], excluded_objects=["Pot"])
+    }
     assert placed["Pot_1"] == "StoveBurner_2"
     assert not set(placed.values()) & {"CounterTop_1", "CounterTop_2", "Shelf_1"}
     with pytest.raises(WorldError, match="unknown 'Bath' in kitchen_1"):

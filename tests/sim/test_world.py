@@ -230,7 +230,7 @@ def test_liquid_adds_mass() -> None:
 def test_knob_heats_and_tap_fills_and_fridge_cools() -> None:
     world = _furnished(
         ObjectPlacement("Pot_1", "StoveBurner_1"), ObjectPlacement("Potato_1", "Pot_1"),
-        ObjectPlacement("Mug_1", "SinkBasin_1"), ObjectPlacement("Apple_1", "Fridge_1"),
+        ObjectPlacement("Mug_1", "SinkBasin_1", (0.12, 2.40)), ObjectPlacement("Apple_1", "Fridge_1"),
     )  # fmt: skip
     world.set_state("StoveKnob_1", "isToggled", True)
     world.set_state("Faucet_1", "isToggled", True)

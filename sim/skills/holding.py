@@ -1,0 +1,94 @@
+"""Hold and Release: a hand takes hold of something where it is, and lets go of what it holds.
+
+Hold is Pick without the lift: the object stays where it is and so does the hand, to steady it for the other one; a door or
+drawer is held by its handle. While furniture is held the robot does not walk. Release opens the hand wherever it is; what it
+held falls. Paper: holding and releasing of the dual-arm action space.
+"""
+
+from __future__ import annotations
+
+from data.records import Action
+from sim.failures import FailureCode, SkillFailure
+from sim.skills.articulate import plan_handle
+from sim.skills.body import Body, wait
+from sim.skills.checks import check_hold
+from sim.skills.grasps import Grasp
+from sim.skills.manipulate import GRASP_GAP_M, Luck, grip, plan_pick, retreat, stow
+from sim.skills.reach import Reach
+from sim.skills.reach_map import HandPose
+from sim.skills.remembered import remembered
+from sim.skills.runner import CONTROL_DT_S, Skill
+
+__all__ = ["assess_hold", "hold", "release"]
+
+
+@remembered
+def assess_hold(body: Body, action: Action) -> tuple[Grasp | None, Reach]:
+    """What Hold would do; no grasp for a handle.
+
+    Raises:
+        SkillFailure: as the skill would before it moves.
+    """
+    assert action.arm is not None and action.object_id is not None
+    thing = body.thing(action.object_id)
+    check_hold(body, action.arm, thing)
+    return plan_pick(body, action.arm, thing) if thing.movable else (None, plan_handle(body, action.arm, thing))
+
+
+def hold(body: Body, action: Action, luck: Luck) -> Skill:
+    """Hold: takes hold of an object or a handle and stays there.
+
+    Raises:
+        SkillFailure: what `assess_hold` refuses, GraspMissed, AlreadyHeld, or a contingency.
+    """
+    grasp, reach = assess_hold(body, action)
+    arm = action.arm
+    assert arm is not None and action.object_id is not None
+    thing = body.thing(action.object_id)
+    name = (thing.object_id,)
+    if grasp is not None:
+        yield from grip(body, arm, grasp, reach, body.solid_geoms(thing))
+        gap = max(body.probe.finger_gaps_m(arm, body.solid_geoms(thing)))
+    else:
+        yield from body.move_hand(arm, 1.0, 0.2)
+        yield from body.move_arm(arm, [*reach.way, reach.before])
+        yield from body.move_arm(arm, [reach.at], speed=0.8)
+        yield from body.move_hand(arm, 0.35, 0.3)
+        gap = body.probe.hand_gap_m(arm, body.part_geoms(thing, "handle"))
+    outcome = luck(action)
+    if gap > GRASP_GAP_M or thing.held_by or outcome != "success":
+        taken = bool(thing.held_by)
+        yield from retreat(body, arm, reach, name)
+        if gap > GRASP_GAP_M:
+            raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": gap})
+        if taken:
+            raise SkillFailure(FailureCode.ALREADY_HELD)
+        raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
+    body.world.attach(arm.value, thing.object_id)
+
+
+def release(body: Body, action: Action, luck: Luck) -> Skill:
+    """Release: opens the hand and draws the arm back; what it held stays or falls.
+
+    Raises:
+        SkillFailure: HandEmpty.
+    """
+    del luck
+    arm = action.arm
+    assert arm is not None
+    name = body.held[arm] if body.lifted is None else body.lifted
+    if name is None:
+        raise SkillFailure(FailureCode.HAND_EMPTY)
+    thing = body.thing(name)
+    body.world.detach(arm.value)
+    yield from body.move_hand(arm, 1.0)
+    position, hand = body.hand_pose(arm)
+    back = body.solve(arm, HandPose(position - 0.08 * hand[:, 0], hand[:, 0], hand[:, 1]), start=body.commanded_arm(arm))
+    if back.error_m < 0.03:
+        yield from body.move_arm(arm, [back.q])
+    yield from stow(body, arm, (name,))
+    yield from wait(0.1)
+    for _ in range(int(1.0 / CONTROL_DT_S)):
+        if body.world.speed_of(thing.object_id) < 0.02:
+            break
+        yield

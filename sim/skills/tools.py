@@ -1,0 +1,184 @@
+"""Skills with a tool in the hand, or the hand as one: Slice, Clean, UseUp.
+
+The tool is brought down on the object by the same checked motion that puts things down, must touch it (within 15 mm), and is
+drawn to and fro; only then the state changes. Every failure brings the arm back first. Paper: slicing, cleaning and using up
+are states of DualTHOR without an action.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Action, Arm
+from sim.failures import FailureCode, SkillFailure
+from sim.liquids import wipe
+from sim.objects import ObjectInstance
+from sim.skills.articulate import plan_press
+from sim.skills.body import Body, wait
+from sim.skills.checks import check_clean, check_slice, check_use_up
+from sim.skills.manipulate import GRASP_GAP_M, Luck, nudge, plan_bring, stow
+from sim.skills.reach import Reach
+from sim.skills.remembered import remembered
+from sim.skills.runner import Skill
+
+__all__ = ["assess_clean", "assess_slice", "assess_use_up", "clean", "slice_object", "use_up"]
+
+Array = NDArray[np.float64]
+
+_STROKE_M: Final = 0.04
+_STROKES: Final = 2
+_PRESS_M: Final = 0.012
+_PRESS_STEPS: Final = 3
+
+
+def _top(body: Body, thing: ObjectInstance) -> Array:
+    """(3,) world point in the middle of an object's upper side."""
+    low, high = body.world.bounds(thing.object_id)
+    return np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, high[2]])
+
+
+def _blade(tool: ObjectInstance) -> Array:
+    """(3,) point of a tool that works, in its own frame: the middle of its first part."""
+    return np.asarray(tool.type.parts[0].center)
+
+
+@remembered
+def assess_slice(body: Body, action: Action) -> Reach:
+    """What Slice would do.
+
+    Raises:
+        SkillFailure: as the skill would before it moves.
+    """
+    assert action.arm is not None and action.object_id is not None
+    thing = body.thing(action.object_id)
+    tool = check_slice(body, action.arm, thing)
+    names = (tool.object_id, thing.object_id, *body.world.parents(thing.object_id)[:1])
+    return plan_bring(body, action.arm, tool, [_top(body, thing)], names, point=_blade(tool), above_m=0.002)[1]
+
+
+@remembered
+def assess_clean(body: Body, action: Action) -> Reach:
+    """What Clean would do.
+
+    Raises:
+        SkillFailure: as the skill would before it moves.
+    """
+    assert action.arm is not None and action.object_id is not None
+    thing = body.thing(action.object_id)
+    tool = check_clean(body, action.arm, thing)
+    spots = [np.asarray(puddle.position) for puddle in body.world.liquids.puddles if puddle.surface == thing.object_id]
+    if not spots:
+        spots = [_top(body, thing)] if thing.movable else body.free_spots(tool, thing, action.arm)
+    if not spots:
+        raise SkillFailure(FailureCode.OBSTRUCTED)
+    return plan_bring(body, action.arm, tool, spots, (tool.object_id, thing.object_id), above_m=0.002)[1]
+
+
+@remembered
+def assess_use_up(body: Body, action: Action) -> Reach:
+    """What UseUp would do.
+
+    Raises:
+        SkillFailure: as the skill would before it moves.
+    """
+    assert action.arm is not None and action.object_id is not None
+    thing = body.thing(action.object_id)
+    check_use_up(body, action.arm, thing)
+    return plan_press(body, action.arm, _top(body, thing) - (0.0, 0.0, 0.01), (thing.object_id,))
+
+
+def slice_object(body: Body, action: Action, luck: Luck) -> Skill:
+    """Slice: draws the knife in the hand through an object.
+
+    Raises:
+        SkillFailure: what `assess_slice` refuses, ToolMissed, or a contingency.
+    """
+    reach = assess_slice(body, action)
+    assert action.arm is not None and action.object_id is not None
+    thing, tool = body.thing(action.object_id), body.thing(body.held[action.arm] or "")
+    yield from _apply(body, action, reach, tool, thing, luck)
+    body.world.set_state(thing.object_id, "isSliced", True)
+    yield from _leave(body, action.arm, reach, tool)
+
+
+def clean(body: Body, action: Action, luck: Luck) -> Skill:
+    """Clean: wipes an object, or what is spilled on it, with the sponge or towel in the hand.
+
+    Raises:
+        SkillFailure: what `assess_clean` refuses, ToolMissed, or a contingency.
+    """
+    reach = assess_clean(body, action)
+    assert action.arm is not None and action.object_id is not None
+    thing, tool = body.thing(action.object_id), body.thing(body.held[action.arm] or "")
+    yield from _apply(body, action, reach, tool, thing, luck)
+    wipe(body.world, thing.object_id)
+    if thing.state.isDirty:
+        body.world.set_state(thing.object_id, "isDirty", False)
+    yield from _leave(body, action.arm, reach, tool)
+
+
+def use_up(body: Body, action: Action, luck: Luck) -> Skill:
+    """UseUp: takes what is left of a roll, a box of tissues or a bottle of soap with the empty hand.
+
+    Raises:
+        SkillFailure: what `assess_use_up` refuses, ToolMissed, or a contingency.
+    """
+    reach = assess_use_up(body, action)
+    assert action.arm is not None and action.object_id is not None
+    arm, thing = action.arm, body.thing(action.object_id)
+    yield from body.move_hand(arm, body.spec.hand.press[2], 0.2)
+    yield from body.move_arm(arm, [*reach.way, reach.before])
+    yield from body.move_arm(arm, [reach.at], speed=0.7)
+    yield from wait(0.1)
+    gap = body.probe.hand_gap_m(arm, body.solid_geoms(thing))
+    outcome = luck(action)
+    if gap <= GRASP_GAP_M and outcome == "success":
+        body.world.set_state(thing.object_id, "isUsedUp", True)
+    yield from body.move_arm(arm, [reach.before])
+    yield from body.move_hand(arm, 1.0, 0.2)
+    yield from stow(body, arm, (thing.object_id,))
+    _judge(gap, outcome)
+
+
+def _judge(gap_m: float, outcome: str) -> None:
+    if gap_m > GRASP_GAP_M:
+        raise SkillFailure(FailureCode.TOOL_MISSED, {"gap_m": gap_m})
+    if outcome != "success":
+        raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
+
+
+def _apply(body: Body, action: Action, reach: Reach, tool: ObjectInstance, thing: ObjectInstance, luck: Luck) -> Skill:
+    """Brings the tool onto the object, presses until it touches, and draws it to and fro.
+
+    Raises:
+        SkillFailure: ToolMissed or a contingency, with the arm at home again.
+    """
+    arm = action.arm
+    assert arm is not None
+    yield from body.move_arm(arm, [*reach.way, reach.before])
+    yield from body.move_arm(arm, [reach.at], speed=0.6)
+    mine, theirs = body.solid_geoms(tool), body.solid_geoms(thing)
+    yield from wait(0.06)
+    gap = body.probe.gap_m(mine, theirs)
+    for _ in range(_PRESS_STEPS):
+        if gap <= 0.5 * GRASP_GAP_M:
+            break
+        yield from nudge(body, arm, np.array([0.0, 0.0, -_PRESS_M]))
+        gap = body.probe.gap_m(mine, theirs)
+    outcome = luck(action)
+    if gap <= GRASP_GAP_M and outcome == "success":
+        along = body.turn_to_world(np.array([1.0, 0.0, 0.0]))
+        for _ in range(_STROKES):
+            yield from nudge(body, arm, _STROKE_M * along)
+            yield from nudge(body, arm, -_STROKE_M * along)
+        return
+    yield from _leave(body, arm, reach, tool)
+    _judge(gap, outcome)
+
+
+def _leave(body: Body, arm: Arm, reach: Reach, tool: ObjectInstance) -> Skill:
+    yield from body.move_arm(arm, [reach.before])
+    yield from stow(body, arm, (tool.object_id,))
