@@ -48,11 +48,12 @@ SCENES: Final[Mapping[str, Scene]] = {
     ),
     "pick_place": Scene(("GoTo(Bottle_1)", "Pick(left, Bottle_1)", f"GoTo({_TABLE})", f"Place(left, {_TABLE})")),
     "both_arms": Scene(
-        ("GoTo(Cup_1)", "Pick(left, Mug_1) & Pick(right, Cup_1)", "ResetArm(left) & ResetArm(right)"),
-        (_on("Mug_1", 1.42, -0.83), _on("Cup_1", 1.78, -0.83)),
+        ("GoTo(Cup_1, auto, 15)", "Pick(left, Cup_1) & Pick(right, Mug_1)", "ResetArm(left) & ResetArm(right)"),
+        (_on("Mug_1", 1.5, -0.83), _on("Cup_1", 1.78, -0.83)),
     ),
-    "door": Scene(("GoTo(Microwave_1)", "Open(left, Microwave_1)", "Close(left, Microwave_1)"), ()),
-    "drawer": Scene(("GoTo(Drawer_1)", "Open(right, Drawer_1)", "Close(right, Drawer_1)"), ()),
+    "open_door": Scene(("GoTo(Microwave_1)", "Open(left, Microwave_1)"), ()),
+    "open_drawer": Scene(("GoTo(Drawer_1)", "Open(right, Drawer_1)"), ()),
+    "close_drawer": Scene(("GoTo(Drawer_1, auto, -25)", "Close(right, Drawer_1)"), (), {"Drawer_1": {"isOpen": True}}),
     "toggle": Scene(("GoTo(StoveKnob_1)", "ToggleOn(left, StoveKnob_1)", "ToggleOff(left, StoveKnob_1)"), ()),
     "hold_release": Scene(("GoTo(Cup_1)", "Hold(right, Cup_1)", "Release(right)"), (_on("Cup_1", 1.5, -0.85),)),
     "slice": Scene(
@@ -73,7 +74,12 @@ SCENES: Final[Mapping[str, Scene]] = {
         (ObjectPlacement("Mug_1", "CounterTop_1", (-0.5, 2.2)),),
         {"Faucet_1": {"isToggled": True}},
     ),
-    "lift": Scene(("GoTo(Box_1)", "Lift(Box_1)", "GoTo(Desk_1)", "PlaceBoth(Desk_1)"), None, {}, "living_room_1"),
+    "lift": Scene(
+        ("GoTo(Box_1)", "Lift(Box_1)", "GoTo(Desk_1)", "PlaceBoth(Desk_1)"),
+        (ObjectPlacement("Box_1", "CoffeeTable_1", (0.0, -0.56)),),
+        {},
+        "living_room_1",
+    ),
 }
 
 

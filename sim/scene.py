@@ -320,7 +320,7 @@ def _add_part(
 ) -> None:
     rgba = list(catalogue.colors[part.color])
     common: dict[str, Any] = {"rgba": rgba, "friction": list(_OBJECT_FRICTION), "condim": 4, "solref": [0.015, 1.0]}
-    if part.options & {"hidden", "liquid"}:
+    if part.options & {"hidden", "liquid", "slice"}:
         common["rgba"] = [*rgba[:3], 0.0]
     if part.options & {"glow"}:
         spec.add_material(name=f"{name}/glow", rgba=[1.0, 1.0, 1.0, 1.0], specular=0.0, emission=0.0)
