@@ -6,6 +6,7 @@ passes give everything: colours from one, segment numbers and depth together fro
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 
@@ -47,6 +48,13 @@ class Canvas:
         mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._context)
         # zero far gives float depth buffers their precision at a distance
         self._context.readDepthMap = int(mujoco.mjtDepthMap.mjDEPTH_ZEROFAR)  # type: ignore[assignment]
+
+    def __del__(self) -> None:
+        """Frees the drawing context in its own OpenGL context: in another one that would delete the other one's objects."""
+        with contextlib.suppress(Exception):  # a context that was never made, or an interpreter that is ending
+            self._gl.make_current()
+            self._context.free()
+            self._gl.free()
 
     def colors(self, scene: mujoco.MjvScene) -> NDArray[np.uint8]:
         """(H, W, 3) uint8 picture of a scene."""

@@ -123,3 +123,15 @@ def test_leaving_out_what_is_not_in_view_changes_no_pixel(room: str) -> None:
             for name in ("rgb", "depth", "segmentation"):
                 assert np.array_equal(getattr(culled, name), getattr(whole, name)), (camera, name)
     assert renderer._out_of_view(int(world.model.camera(world.robot.head_camera).id)).mean() > 0.2  # type: ignore[union-attr]
+
+
+def test_canvases_that_are_given_up_harm_no_other() -> None:
+    world = World(None, "bathroom_1")
+    view = world.render("overview", 40, 40, segmentation=True)
+    for size in range(41, 75):  # more than the process keeps
+        world.render("overview", size, size)
+    world.close()
+    again = world.render("overview", 40, 40, segmentation=True)
+    assert np.array_equal(view.rgb, again.rgb) and np.array_equal(view.segmentation, again.segmentation)
+    lamp = World(None, "living_room_1")
+    assert len(np.unique(lamp.render("overview", 64, 64, segmentation=True).segmentation)) > 5
