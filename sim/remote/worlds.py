@@ -117,6 +117,7 @@ class Worlds:
             with self._lock:
                 self._opening -= 1
         name = secrets.token_urlsafe(12)
+        world.used_s = time.monotonic()  # opening takes seconds, which are not idle ones
         with self._lock:
             self._worlds[name] = world
         _LOG.info("world opened: %s", {key: arguments[key] for key in sorted(arguments)})

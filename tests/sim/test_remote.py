@@ -124,7 +124,7 @@ def test_bad_requests(
 
 
 def test_idle_worlds_are_closed() -> None:
-    server = RemoteServer(ServerConfig(port=0, worlds=1, idle_s=0.4))
+    server = RemoteServer(ServerConfig(port=0, worlds=1, idle_s=2.0))
     thread = _serving(server)
     client = RemoteController(server.url, images=[], **SMALL)
     process = next(iter(server.worlds._worlds.values())).process
