@@ -215,25 +215,32 @@ class Controller:
         world, body = self.session.world, self.session.body
         if name not in world.objects:
             raise ValueError(f"unknown object {call.get('objectID')!r} in {world.room.name}")
-        comfort = body.comfortable_distance_m()
         point = body.interaction_point(name)
-        best = best_stance(body.navigation(), body.commanded_base(), point[:2], comfort, None, 0.0, body.faces_rad(name))
-        reachable = interactable_poses(body, name, limit=1000)
-        if best is None and not reachable:
+        best = best_stance(
+            body.navigation(),
+            body.commanded_base(),
+            point[:2],
+            body.comfortable_distance_m(),
+            None,
+            0.0,
+            body.faces_rad(name),
+        )
+        if best is not None:
+            stance = best[0]
+            within = [h for h in body.heights() if any(body.within(arm, point, h, stance) for arm in Arm)]
+            self.session.teleport(stance.x, stance.y, stance.yaw_rad, max(within, default=None))
+            if within:
+                return self._arrived()
+        poses = interactable_poses(body, name, limit=1000)
+        if poses:  # nearer than is comfortable, or from another side
+            place = best[0].position if best is not None else point[:2]
+            near = min(poses, key=lambda pose: float(np.hypot(pose.x_m - place[0], pose.y_m - place[1])))
+            self.session.teleport(near.x_m, near.y_m, float(np.radians(near.yaw_deg)), near.pelvis_height_m)
+        elif best is None:
             return self._reply("tp", False, f"there is no place to stand near {call.get('objectID')}")
-        stance = best[0] if best is not None else None
-        height = None
-        if reachable:
-            place = stance.position if stance is not None else point[:2]
-            near = min(reachable, key=lambda p: (float(np.hypot(p.x_m - place[0], p.y_m - place[1])), -p.pelvis_height_m))
-            height = near.pelvis_height_m
-            if stance is None or not any(body.within(arm, point, h, stance) for arm in Arm for h in body.heights()):
-                self.session.teleport(near.x_m, near.y_m, float(np.radians(near.yaw_deg)), height)
-                self._remember()
-                return self._reply("tp", True, "")
-            height = max(h for h in body.heights() if any(body.within(arm, point, h, stance) for arm in Arm))
-        assert stance is not None
-        self.session.teleport(stance.x, stance.y, stance.yaw_rad, height)
+        return self._arrived()
+
+    def _arrived(self) -> Reply:
         self._remember()
         return self._reply("tp", True, "")
 

@@ -79,12 +79,11 @@ def _beside(body: Body, arm: Arm, vessel: ObjectInstance, top: Array, radius: fl
     sight = top[:2] - body.shoulder(arm)[:2]
     across = np.array([-sight[1], sight[0]]) / max(float(np.linalg.norm(sight)), 1e-6)
     outer = 1.0 if arm is Arm.LEFT else -1.0
-    low = max(top[2], float(body.world.bounds(vessel.object_id)[0][2]) if radius > 0.2 else top[2])
     spots = []
     for side in (outer, -outer):
         for share in (0.8, 0.5, 1.1):
             offset = side * share * height * across
-            spots.append(np.array([top[0] + offset[0], top[1] + offset[1], low]))
+            spots.append(np.array([top[0] + offset[0], top[1] + offset[1], top[2]]))
     return spots
 
 
