@@ -22,6 +22,8 @@ __all__ = ["RemoteServer", "ServerConfig", "is_loopback"]
 
 _LOG = logging.getLogger(__name__)
 _MAX_BODY: Final = 1 << 20
+#: The most of a body that is too long that is read and thrown away.
+_MAX_DRAIN: Final = 1 << 24
 _TIMEOUT_S: Final = 60.0
 
 
@@ -115,6 +117,7 @@ class _Handler(BaseHTTPRequestHandler):
     server_version = "dualthor"
     sys_version = ""
     timeout = _TIMEOUT_S
+    _unread = 0
 
     def do_GET(self) -> None:
         if not self._allowed():
@@ -178,8 +181,10 @@ class _Handler(BaseHTTPRequestHandler):
         if not length.isdigit() or int(length) > _MAX_BODY:
             self._fail(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a body needs a Content-Length of at most {_MAX_BODY}")
             return None
+        data = self.rfile.read(int(length))
+        self._unread = 0
         try:
-            return loads(self.rfile.read(int(length)))
+            return loads(data)
         except ProtocolError as error:
             self._fail(HTTPStatus.BAD_REQUEST, str(error))
             return None
@@ -196,8 +201,18 @@ class _Handler(BaseHTTPRequestHandler):
                 return False
         return True
 
+    def parse_request(self) -> bool:
+        """Notes how long the body is, which an answer before it is read has to wait for."""
+        fine = super().parse_request()
+        length = self.headers.get("Content-Length", "") if fine else ""
+        self._unread = int(length) if length.isdigit() and len(length) < 12 else 0
+        return fine
+
     def _fail(self, status: HTTPStatus, message: str) -> None:
         self.close_connection = True
+        left = min(self._unread, _MAX_DRAIN)  # a client that is still sending would not see the answer
+        while left > 0 and (read := len(self.rfile.read(min(left, 1 << 16)))):
+            left -= read
         self._send(status, {"error": message})
 
     def _send(self, status: HTTPStatus, value: Mapping[str, Any]) -> None:
