@@ -23,7 +23,7 @@ from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
-from sim.skills.reach import Reach, blame, fulfils, plan_reach
+from sim.skills.reach import Reach, explained, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
@@ -120,10 +120,7 @@ def assess_open_close(body: Body, action: Action) -> Pull:
             raise SkillFailure(FailureCode.OBSTRUCTED)
         return best
 
-    try:
-        return search()
-    except SkillFailure:
-        raise blame(body, {arm: handle}, search) from None
+    return explained(body, {arm: handle}, search)
 
 
 def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
@@ -143,10 +140,7 @@ def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
                 return reach
         raise SkillFailure(FailureCode.OBSTRUCTED)
 
-    try:
-        return search()
-    except SkillFailure:
-        raise blame(body, {arm: handle}, search) from None
+    return explained(body, {arm: handle}, search)
 
 
 def _plan_pull(body: Body, arm: Arm, part: MovingPart, reach: Reach, hand: Array, goal: float, opening: bool) -> Pull | None:
@@ -309,10 +303,7 @@ def plan_press(body: Body, arm: Arm, point: Array, ignore: tuple[str, ...]) -> R
                 return reach
         raise SkillFailure(FailureCode.OBSTRUCTED)
 
-    try:
-        return search()
-    except SkillFailure:
-        raise blame(body, {arm: point}, search) from None
+    return explained(body, {arm: point}, search)
 
 
 def toggle(body: Body, action: Action, luck: Luck) -> Skill:

@@ -22,7 +22,7 @@ from sim.objects import ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_pick, check_place
 from sim.skills.grasps import Grasp, grasp_candidates
-from sim.skills.reach import Reach, blame, fulfils, plan_reach, route
+from sim.skills.reach import Reach, blame, explained, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
@@ -329,10 +329,7 @@ def plan_bring(
                     return spot, reach, -(turn @ pointing)
         raise SkillFailure(FailureCode.OBSTRUCTED)
 
-    try:
-        return search()
-    except SkillFailure:
-        raise blame(body, {arm: spots[0] + lift - offset}, search) from None
+    return explained(body, {arm: spots[0] + lift - offset}, search)
 
 
 def place(body: Body, action: Action, luck: Luck) -> Skill:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,10 @@ from sim.failures import FailureCode, SkillFailure
 from sim.skills.body import REACH_TOLERANCE_M, ArmGoal, Body
 from sim.skills.reach_map import HandPose
 
-__all__ = ["Reach", "blame", "plan_reach", "route"]
+__all__ = ["Reach", "blame", "explained", "plan_reach", "route"]
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 #: How well the fingers must agree with the wished directions (cosines) for a grasp to be tried.
 MIN_POINTING: Final = 0.75
@@ -80,6 +81,18 @@ def blame(body: Body, points: Mapping[Arm, Array], plan: Callable[[], object]) -
     if not common or not all(body.within(arm, p, present) for arm, p in points.items()):
         return SkillFailure(FailureCode.TOO_FAR, {"reach_m": gap})
     return SkillFailure(FailureCode.OBSTRUCTED, {"gap_m": gap})
+
+
+def explained(body: Body, points: Mapping[Arm, Array], search: Callable[[], T]) -> T:
+    """What a search finds; a search that fails is blamed on distance, height or obstruction, see `blame`.
+
+    Raises:
+        SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
+    """
+    try:
+        return search()
+    except SkillFailure:
+        raise blame(body, points, search) from None
 
 
 def route(
