@@ -29,6 +29,9 @@ MAX_SIZE: Final = 1280
 _MAX_GEOMS: Final = 1500
 #: A geom group that is not drawn.
 _UNSEEN_GROUP: Final = 5
+#: Cameras that go with the robot around it; they stay inside the room and before the furniture.
+_FOLLOWING: Final = ("front", "left", "right", "behind")
+_WALL_GAP_M: Final = 0.12
 _ROBOT: Final = -2
 _NOTHING: Final = -1
 
@@ -61,11 +64,30 @@ def camera_intrinsics(world: World, camera: str, height: int, width: int) -> NDA
 
 
 def camera_pose(world: World, camera: str) -> NDArray[np.float64]:
-    """(4, 4) pose of a camera in the world, x right, y down, z forward."""
+    """(4, 4) pose of a camera in the world, x right, y down, z forward; one around the robot comes closer before a wall."""
     index, pose = _camera_id(world, camera), np.eye(4)
     pose[:3, :3] = world.data.cam_xmat[index].reshape(3, 3) * np.array([1.0, -1.0, -1.0])
-    pose[:3, 3] = world.data.cam_xpos[index]
+    pose[:3, 3] = _unobstructed(world, index) if camera in _FOLLOWING else world.data.cam_xpos[index]
     return pose
+
+
+def _unobstructed(world: World, camera: int) -> NDArray[np.float64]:
+    """(3,) place of a camera around the robot, drawn in along its sight to where no wall or furniture is in between."""
+    model, data = world.model, world.data
+    target, place = data.xpos[int(model.cam_bodyid[camera])], data.cam_xpos[camera]
+    away = place - target
+    length = float(np.linalg.norm(away))
+    hit, free, start = np.zeros(1, dtype=np.int32), length + _WALL_GAP_M, 0.0
+    furniture = np.array([1, 1, 0, 0, 0, 0], dtype=np.uint8)  # the robot's own geoms are in other groups
+    while start < free:
+        distance = mujoco.mj_ray(model, data, target + start * away / length, away / length, furniture, 1, -1, hit)
+        if distance < 0.0:
+            break
+        start += distance + 0.01
+        if int(model.body_weldid[model.geom_bodyid[hit[0]]]) == 0:  # what can move may be looked through
+            free = min(free, start - 0.01)
+            break
+    return target + away / length * max(free - _WALL_GAP_M, 0.3)
 
 
 def _camera_id(world: World, camera: str) -> int:
@@ -105,6 +127,7 @@ class Renderer:
         self._camera.type = int(mujoco.mjtCamera.mjCAMERA_FIXED)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[int(flag)] = int(pretty)
+        self._planes = np.flatnonzero(world.model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))
         robot = np.isin(world.model.geom_bodyid, list(world.robot_body_ids))
         labels = np.where(robot, _ROBOT, world.object_of_geom).astype(np.int32)
         self._labels = np.append(labels, _NOTHING)  # the last entry is what geom -1, the sky, maps to
@@ -122,6 +145,12 @@ class Renderer:
             out |= np.abs(lateral) * np.cos(edge) + offsets[:, 2] * np.sin(edge) > radius
         return out & (radius > 0.0)
 
+    def _seen_from_behind(self, place: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Walls, floor or ceiling that a camera outside the room looks through; where there are none the sky is not seen."""
+        data, planes = self._world.data, self._planes
+        normals = data.geom_xmat[planes].reshape(-1, 3, 3)[:, :, 2]
+        return planes[np.einsum("pi,pi->p", place - data.geom_xpos[planes], normals) < 0.0]
+
     def view(self, camera: str = "head", *, depth: bool = False, segmentation: bool = False) -> View:
         """Draws one camera as the world is now.
 
@@ -129,15 +158,21 @@ class Renderer:
             ValueError: on an unknown camera.
         """
         world = self._world
-        self._camera.fixedcamid = _camera_id(world, camera)
+        index = self._camera.fixedcamid = _camera_id(world, camera)
         mujoco.mj_camlight(world.model, world.data)
+        place, pose = world.data.cam_xpos[index].copy(), camera_pose(world, camera)
+        world.data.cam_xpos[index] = pose[:3, 3]
         everything = int(mujoco.mjtCatBit.mjCAT_ALL)
         groups = world.model.geom_group
         kept = groups.copy()
         if not self._pretty:  # shadows come from what is not in view, too
-            groups[self._out_of_view(self._camera.fixedcamid)] = _UNSEEN_GROUP
+            groups[self._out_of_view(index)] = _UNSEEN_GROUP
+        outside = self._seen_from_behind(pose[:3, 3])
+        groups[outside] = _UNSEEN_GROUP
+        self._scene.flags[int(mujoco.mjtRndFlag.mjRND_SKYBOX)] = int(len(outside) > 0)
         mujoco.mjv_updateScene(world.model, world.data, self._option, None, self._camera, everything, self._scene)
         groups[:] = kept
+        world.data.cam_xpos[index] = place
         distances = labels = None
         if depth or segmentation:
             metres, geoms = self._canvas.depth_and_geoms(world.model, self._scene)
@@ -148,5 +183,5 @@ class Renderer:
             distances,
             labels,
             camera_intrinsics(world, camera, self._height, self._width),
-            camera_pose(world, camera),
+            pose,
         )

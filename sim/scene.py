@@ -55,6 +55,7 @@ HELD_DOOR_BITS: Final = (16, 0)
 _BASE_GAINS: Final = {"base_x": 2.0e5, "base_y": 2.0e5, "base_z": 3.0e5, "base_yaw": 2.5e4, "base_pitch": 2.5e4}
 _ARENA_BYTES: Final = 8 << 20
 _WALLS: Final = ("north", "east", "south", "west")
+_CEILING: Final = (0.97, 0.97, 0.95)
 _OBJECT_FRICTION: Final = (1.0, 0.01, 0.001)
 _MOVING_MASS_KG: Final = {"hinge": 2.5, "slide": 1.5}
 
@@ -224,6 +225,11 @@ def _add_room(spec: mujoco.MjSpec, room: Room, catalogue: Catalogue) -> None:
         pos, axes, half = walls[name]
         geom = world.add_geom(name=f"wall_{name}", type=plane, size=[half, h / 2, 0.1], pos=pos, rgba=[*color, 1.0], **bits)
         geom.quat = _quat(axes[:3], axes[3:])
+    # A ceiling is several times cheaper to draw than the sky around the walls; nothing touches it.
+    ceiling = world.add_geom(
+        name="ceiling", type=plane, size=[hx, hy, 0.1], pos=[cx, cy, h], rgba=[*_CEILING, 1.0], contype=0, conaffinity=0
+    )
+    ceiling.quat = _quat([1, 0, 0], [0, -1, 0])
     for index, part in enumerate(room.decor):
         _add_part(spec, world, f"decor/{index}", part, (0.0, 0.0, 0.0), catalogue, STATIC_BITS, 0.0)
     for index in range(PUDDLES):  # spilled liquid is shown by them, see sim.liquids
