@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sim.robots.kinematics import RobotModel, root_quaternion
 
-__all__ = ["Crouch", "crouch", "pelvis_height_range"]
+__all__ = ["Crouch", "crouch", "pelvis_height_range", "solve_legs"]
 
 Array = NDArray[np.float64]
 #: Sole error above which a height counts as out of reach.
@@ -86,7 +86,7 @@ def _crouch_with_lean(robot: RobotModel, pelvis_height_m: float, pitch_rad: floa
     posture[legs] = _bent_start(robot, pelvis_height_m)[legs]
     for _ in range(8):
         targets = [pin.SE3(np.eye(3), np.array([forward, lateral[i], 0.0])) for i in range(2)]
-        posture, error = _solve_legs(robot, root, posture, targets)
+        posture, error = solve_legs(robot, root, posture, targets)
         offset = float(robot.centre_of_mass(root, posture)[0]) - forward
         if abs(offset) < 5e-4:
             break
@@ -117,14 +117,38 @@ def _pitch_sign(robot: RobotModel, joint: str) -> float:
     return 1.0 if column[1] >= 0.0 else -1.0
 
 
-def _solve_legs(robot: RobotModel, root: Array, posture: Array, targets: list[pin.SE3]) -> tuple[Array, float]:
+def solve_legs(
+    robot: RobotModel,
+    root: Array,
+    posture: Array,
+    targets: list[pin.SE3],
+    *,
+    level: float = 1.0,
+    damping: float = _DAMPING,
+    iterations: int = 60,
+) -> tuple[Array, float]:
+    """Leg joints that put the soles at two poses, world frame, from the legs of `posture`.
+
+    Args:
+        robot: kinematics.
+        root: (7,) pose of the pelvis.
+        posture: (J,) joints.
+        targets: poses of the left and the right sole.
+        level: weight of a radian of roll or pitch of a sole against a metre.
+        damping: of the Gauss-Newton steps.
+        iterations: how many at most.
+
+    Returns:
+        (J,) joints, and the largest distance of a sole from its place (m), its turn counted with 0.1 m per radian.
+    """
     model, data = robot.model, robot.data
     legs = robot.indices(robot.spec.leg_joints)
     columns = np.array([model.joints[model.getJointId(name)].idx_v for name in robot.spec.leg_joints])
     soles = [robot.frame_id("left_sole"), robot.frame_id("right_sole")]
     q = posture.copy()
     worst = np.inf
-    for _ in range(60):
+    weights = np.tile([1.0, 1.0, 1.0, level, level, 1.0], len(soles))
+    for _ in range(iterations):
         full = robot.configuration(root, q)
         pin.computeJointJacobians(model, data, full)
         pin.updateFramePlacements(model, data)
@@ -139,8 +163,8 @@ def _solve_legs(robot: RobotModel, root: Array, posture: Array, targets: list[pi
             rows.append(pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:, columns])
         if worst < 1e-6:
             break
-        jacobian, error = np.concatenate(rows), np.concatenate(errors)
-        step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + _DAMPING * np.eye(len(error)), error)
+        jacobian, error = weights[:, None] * np.concatenate(rows), weights * np.concatenate(errors)
+        step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(len(error)), error)
         q[legs] = np.clip(q[legs] + np.clip(step, -0.3, 0.3), robot.lower[legs], robot.upper[legs])
     return q, worst
 

@@ -28,9 +28,11 @@ from sim.objects import ObjectInstance
 from sim.placement import OVERHANG_SHARE
 from sim.robots.arm_ik import PerArmSolver
 from sim.robots.build_solver import RobotKit, robot_kit
+from sim.robots.footsteps import footsteps
 from sim.robots.solver import ReachTarget
 from sim.scene import BASE_JOINTS
 from sim.skills.clearance import ClearanceProbe
+from sim.skills.gait import leg_motion
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach_map import WOUND_RAD, HandPose, ReachMap, reach_maps
 from sim.skills.runner import CONTROL_DT_S, Skill
@@ -123,6 +125,11 @@ class Body:
             arm: np.array([self._actuators[name] for name in self.spec.arms[arm.value].hand_joints]) for arm in Arm
         }
         self._waist_ids = np.array([self._actuators[name] for name in self.spec.waist_joints])
+        self._leg_ids = np.array([self._actuators[name] for name in self.spec.leg_joints])
+        self._hand_joints = np.array([int(model.joint(n).id) for arm in Arm for n in self.spec.arms[arm.value].hand_joints])
+        sliding = model.jnt_type[self._hand_joints] == int(mujoco.mjtJoint.mjJNT_SLIDE)
+        self._hand_scale = np.where(sliding, 0.2, 1.0)
+        self._mine = np.where(np.isin(model.geom_bodyid, list(world.robot_body_ids)), 1, -1)
         self._columns = {arm: kit.model.indices(self.spec.arms[arm.value].joints) for arm in Arm}
         self.considered_height_m: float | None = None
         #: Whether a refusal may stay unexplained: no other pelvis heights are tried to find its reason.
@@ -180,6 +187,40 @@ class Body:
     def command_height(self, pelvis_height_m: float) -> None:
         """Sets the pelvis height and the legs that go with it."""
         self.world.command_height(pelvis_height_m)
+
+    def command_legs(self, joints: Array) -> None:
+        """Sets the leg joints' targets (L,)."""
+        self.world.data.ctrl[self._leg_ids] = joints
+
+    def walking_legs(self, way: Array) -> Array:
+        """(T, L) leg joints that walk along a way (T, 3) of the base: x, y and yaw."""
+        root = np.array([0.0, 0.0, 0.0, *_quaternion_about_y(self.crouches.pitch(self.pelvis_height_m))])
+        soles = self.kinematics.frames(root, self.crouches.posture(self.pelvis_height_m), ("left_sole", "right_sole"))
+        return leg_motion(footsteps(self.kit), self.pelvis_height_m, soles[:, :2, 3], way)
+
+    def pressed_m(self) -> float:
+        """How deep the robot presses into anything that it does not hold, metres."""
+        data = self.world.data
+        if data.ncon == 0:
+            return 0.0
+        owner = self._contact_owner()[data.contact.geom[: data.ncon]]  # (C, 2): 1 robot, 0 held, -1 else
+        touching = np.prod(owner, axis=1) < 0
+        return float(-np.min(data.contact.dist[: data.ncon][touching], initial=0.0))
+
+    def strain(self) -> float:
+        """How far the hands' joints are bent beyond their limits: rad, and metres of sliding joints divided by 0.2."""
+        model = self.world.model
+        values, scale = self.world.data.qpos[model.jnt_qposadr[self._hand_joints]], self._hand_scale
+        low, high = model.jnt_range[self._hand_joints].T
+        return float(np.max(np.maximum(low - values, values - high) / scale, initial=0.0))
+
+    def _contact_owner(self) -> NDArray[np.int64]:
+        """(ngeom,) 1 for the robot's geoms, 0 for those of what it holds, -1 for all others."""
+        owner = self._mine.copy()
+        for thing in self.world.objects.values():
+            if thing.held_by:
+                owner[thing.geom_ids] = 0
+        return owner
 
     def navigation(self) -> NavigationMap:
         """Free space for the base, as the room is now."""

@@ -1,7 +1,8 @@
 """Body skills: walk, turn, change pelvis height, go to an object.
 
-The base follows collision-free paths as a disc; the legs keep the soles on the floor (see `sim.robots.leg_ik`). Balance while
-walking is not simulated: the base is driven by servos, which the README states among the limits.
+The base follows collision-free paths as a disc, the feet step along (`sim.skills.gait`), and a hand that is pressed against
+something on the way stops the walk. Balance while walking is not simulated: the base is driven by servos, which the README
+states among the limits.
 
 Paper: body actions of the DualTHOR action space. GoTo replaces the paper's teleporting navigation by a planned path.
 """
@@ -30,6 +31,12 @@ TURN_ACCELERATION_RAD_S2: Final = 5.0
 HEIGHT_SPEED_M_S: Final = 0.35
 HEIGHT_ACCELERATION_M_S2: Final = 1.0
 
+#: How deep an arm may press into something before the base stops, and by how much (rad, or m times 0.2) fingers may be bent
+#: beyond their limits.
+_PRESSED_M: Final = 0.03
+_STRAIN: Final = 0.025
+_RETREAT_S: Final = 0.35
+
 #: Heading of a step relative to the robot's own, by action.
 _DIRECTIONS: Final = {"MoveAhead": 0.0, "MoveLeft": np.pi / 2, "MoveBack": np.pi, "MoveRight": -np.pi / 2}
 #: GoTo walks backwards or sideways over ways shorter than this, and turns into the way before longer ones.
@@ -42,34 +49,77 @@ _DISTANCE_WEIGHT: Final = 6.0
 
 def _turn(body: Body, yaw_rad: float) -> Skill:
     start = body.commanded_base()
-    change = wrap_angle(yaw_rad - start.yaw_rad)
-    yield from _turn_by(body, change)
+    yield from _turn_by(body, wrap_angle(yaw_rad - start.yaw_rad))
 
 
 def _turn_by(body: Body, change_rad: float) -> Skill:
     start = body.commanded_base()
     ways = plan(np.array([[0.0], [change_rad]]), TURN_SPEED_RAD_S, TURN_ACCELERATION_RAD_S2)
-    time_s = 0.0
-    while time_s < ways.duration_s:
-        time_s += CONTROL_DT_S
-        body.command_base(start.x, start.y, start.yaw_rad + float(ways.at(time_s)[0]))
-        yield
+    turns = [float(ways.at(time_s)[0]) for time_s in _ticks(ways.duration_s)]
+    yield from _travel(body, np.array([(start.x, start.y, start.yaw_rad + turn) for turn in turns]))
 
 
 def _walk(body: Body, path: NDArray[np.float64], along: bool) -> Skill:
     """Follows a polyline; `along` turns the heading into the way as it goes, at a bounded rate."""
     way = plan_polyline(path, WALK_SPEED_M_S, WALK_ACCELERATION_M_S2)
     yaw = body.commanded_base().yaw_rad
-    time_s = 0.0
-    while time_s < way.duration_s:
-        time_s += CONTROL_DT_S
+    poses = []
+    for time_s in _ticks(way.duration_s):
         x, y = way.at(time_s)
         if along:
             ahead = way.at(time_s + 0.25) - (x, y)
             if float(np.hypot(*ahead)) > 1e-3:
                 error = wrap_angle(float(np.arctan2(ahead[1], ahead[0])) - yaw)
                 yaw += float(np.clip(4.0 * error, -TURN_SPEED_RAD_S, TURN_SPEED_RAD_S)) * CONTROL_DT_S
-        body.command_base(float(x), float(y), yaw)
+        poses.append((float(x), float(y), yaw))
+    yield from _travel(body, np.array(poses))
+
+
+def _ticks(duration_s: float) -> list[float]:
+    """The times of the control ticks of a motion, the end included."""
+    times = [0.0]
+    while times[-1] < duration_s:
+        times.append(times[-1] + CONTROL_DT_S)
+    return times[1:]
+
+
+def _travel(body: Body, way: NDArray[np.float64]) -> Skill:
+    """Takes the base along a way (T, 3) of x, y and yaw, with walking legs; a hand that runs into something ends it.
+
+    What presses at the start may go on pressing a little, so that the robot can walk away from it.
+
+    Raises:
+        SkillFailure: BlockedPath with the metres that were walked, after a step back.
+    """
+    if len(way) == 0:
+        return
+    start = body.commanded_base()
+    way = np.concatenate([[(start.x, start.y, start.yaw_rad)], way])  # (T + 1, 3)
+    legs = body.walking_legs(way)
+    press_m, strain = (
+        max(limit, now + 0.5 * limit) for limit, now in ((_PRESSED_M, body.pressed_m()), (_STRAIN, body.strain()))
+    )
+    for tick in range(1, len(way)):
+        body.command_base(*map(float, way[tick]))
+        body.command_legs(legs[tick])
+        yield
+        if body.strain() > strain or body.pressed_m() > press_m:
+            yield from _retreat(body, way[: tick + 1], legs)
+            walked = float(np.linalg.norm(body.commanded_base().position - start.position))
+            raise SkillFailure(FailureCode.BLOCKED_PATH, {"travel_m": walked})
+
+
+def _retreat(body: Body, way: NDArray[np.float64], legs: NDArray[np.float64]) -> Skill:
+    """Goes back along a way until nothing presses, a third of a second at most, and brings the feet together."""
+    tick = len(way) - 1
+    for tick in range(len(way) - 2, max(len(way) - 2 - round(_RETREAT_S / CONTROL_DT_S), -1), -1):
+        body.command_base(*map(float, way[tick]))
+        body.command_legs(legs[tick])
+        yield
+        if body.strain() <= 0.5 * _STRAIN and body.pressed_m() <= 0.5 * _PRESSED_M:
+            break
+    for share in np.linspace(0.0, 1.0, round(0.3 / CONTROL_DT_S))[1:]:
+        body.command_legs((1.0 - share) * legs[tick] + share * legs[0])
         yield
 
 
@@ -102,7 +152,11 @@ def move(body: Body, action: Action) -> Skill:
 
 
 def rotate(body: Body, action: Action) -> Skill:
-    """Turns on the spot."""
+    """Turns on the spot.
+
+    Raises:
+        SkillFailure: BlockedPath when a hand runs into something.
+    """
     degrees = action.amount if action.amount is not None else float(action.spec.amount_default or 0.0)
     sign = 1.0 if action.name == "RotateLeft" else -1.0
     yield from _turn_by(body, sign * np.deg2rad(degrees))
@@ -188,7 +242,7 @@ def go_to(body: Body, action: Action) -> Skill:
     """Walks to a free stance near an object and faces it; the pelvis height stays.
 
     Raises:
-        SkillFailure: NoFreePose.
+        SkillFailure: NoFreePose, or BlockedPath when a hand runs into something on the way.
     """
     assert action.object_id is not None
     target = body.interaction_point(action.object_id)[:2]

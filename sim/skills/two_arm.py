@@ -32,8 +32,14 @@ Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _APART_M: Final = 0.125
 _TOLERANCE_M: Final = 0.02
+#: How far an object has to come up to be lifted, and how far the first, straight part of the lift goes.
+_RISE_M: Final = 0.08
+_FIRST_M: Final = 0.05
 #: Ways to hold what was lifted: metres up and towards the body.
-_HOLDS: Final = ((0.3, 0.2), (0.3, 0.12), (0.3, 0.05), (0.25, 0.2), (0.25, 0.1), (0.2, 0.06), (0.15, 0.05), (0.08, 0.0))
+_HOLDS: Final = ((0.3, 0.2), (0.3, 0.12), (0.3, 0.05), (0.25, 0.2), (0.25, 0.1), (0.2, 0.06), (0.2, 0.0),
+                 (0.15, 0.05), (0.15, 0.0), (0.12, 0.0), (0.08, 0.0))  # fmt: skip
+#: Sagging of what is held that is made up for.
+_SAG_M: Final = 0.015
 #: Radians of tilt that a metre of height is worth when one of them is chosen.
 _HEIGHT_WEIGHT: Final = 1.2
 
@@ -98,6 +104,9 @@ def assess_lift(body: Body, action: Action) -> BothReach:
         at = _goal(body, sides, 0.004, before.arms)
         if before.error_m > _TOLERANCE_M or at.error_m > _TOLERANCE_M:
             raise SkillFailure(FailureCode.OBSTRUCTED)
+        risen = {arm: (point + _RISE_M * _UP, normal) for arm, (point, normal) in sides.items()}
+        if _goal(body, risen, 0.004, at.arms).error_m > _TOLERANCE_M:  # taken, but not got off what carries it
+            raise SkillFailure(FailureCode.OBSTRUCTED)
         for arm in Arm:
             if not (body.probe.free(arm, [before.arms[arm]], opening=1.0) and body.probe.free(arm, [at.arms[arm]], name, 1.0)):
                 raise SkillFailure(FailureCode.OBSTRUCTED)
@@ -142,7 +151,7 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
     outcome = luck(action)
     for arm in Arm:
         body.world.attach(arm.value, thing.object_id)
-    first = _shifted(body, 0.05, 0.0)
+    first = _shifted(body, _FIRST_M, 0.0)
     yield from body.move_both([first], speed=0.5)
     if outcome != "success":
         for arm in Arm:
@@ -156,11 +165,28 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
     options = [(up, _shifted(body, up, back)) for up, back in _HOLDS]
     options = [(up, goal) for up, goal in options if goal.error_m <= _TOLERANCE_M]
     if options:
-        _, hold = min(options, key=lambda option: option[1].tilt_rad - _HEIGHT_WEIGHT * option[0])
+        before_m = _hands_m(body)
+        up, hold = min(options, key=lambda option: option[1].tilt_rad - _HEIGHT_WEIGHT * option[0])
         yield from body.move_both([hold], speed=0.5)
+        yield from wait(0.1)
+        sag_m = before_m + up - _hands_m(body)
+        if sag_m > _SAG_M:  # the servos give way under the load
+            higher = _shifted(body, 2.0 * min(sag_m, 0.06), 0.0)
+            if higher.error_m <= _TOLERANCE_M:
+                yield from body.move_both([higher], speed=0.5)
     yield from wait(0.1)
     if body.lifted != thing.object_id or thing.object_id in body.world.all_parents():
+        for arm in Arm:
+            if thing.object_id == body.held[arm] or arm.value in thing.held_by:
+                body.world.detach(arm.value)
+        yield from body.move_both([reach.before])
+        yield from body.stow_both()
         raise SkillFailure(FailureCode.DROPPED)
+
+
+def _hands_m(body: Body) -> float:
+    """Mean height of both hands as they are, metres."""
+    return float(np.mean([body.hand_pose(arm)[0][2] for arm in Arm]))
 
 
 def _press(body: Body, reach: BothReach, thing: ObjectInstance) -> Skill:

@@ -150,7 +150,10 @@ def _put_down_lifted(leaves: Sequence[Predicate], facts: Facts) -> Job:
     for leaf in leaves:
         if leaf.kind in ("on", "in") and leaf.object_id == facts.lifted:
             return Job("PlaceBoth", leaf.receptacle_id)
-    return Job("PlaceBoth", facts.homes[facts.lifted or ""])
+    home = facts.homes.get(facts.lifted or "")
+    open_places = (name for name, entry in facts.objects.items() if entry["receptacle"] and not entry["moveable"]
+                   and not entry["pickupable"] and not facts.is_closed(name))  # fmt: skip
+    return Job("PlaceBoth", home if home is not None else next(open_places))
 
 
 def _through_door(job: Job, facts: Facts) -> list[Job]:
