@@ -111,6 +111,7 @@ class Controller:
         third_party_cameras: names of `sim.rendering.CAMERAS` drawn with every event.
         privileged: allows TP, GetInteractablePoses, SetObjectPoses and InitialRandomSpawn.
         task: start from a task instead of the room's default.
+        contingency: name of the outcome distributions (`configs/contingency`, or one's own assets).
         undo_limit: how many steps Undo goes back; each takes about a megabyte.
 
     Attributes:
@@ -133,10 +134,11 @@ class Controller:
         privileged: bool = False,
         task: TaskLike | None = None,
         undo_limit: int = 100,
+        contingency: str = "default",
     ) -> None:
         if width != height:
             raise ValueError(f"frames are square, got width {width} and height {height}")
-        self.session = Session(robot_type, difficulty, width)
+        self.session = Session(robot_type, difficulty, width, contingency)
         self._size, self._seed = width, seed
         self._cameras, self._privileged = tuple(third_party_cameras), privileged
         self._task: TaskLike = FreePlay(scene) if task is None else task

@@ -35,6 +35,8 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
         tasks: tasks to choose from at each reset; the default kitchen without a goal when empty.
         difficulty: easy, medium, hard or natural.
         image_size: side of the picture, pixels.
+        render_mode: None, or `rgb_array` for `render`.
+        contingency: name of the outcome distributions.
 
     Observation space: `image` (H, W, 3) uint8, `motion` (64, F) float32, `joints` (J,) float32, `key_bodies` (K, 3) float32.
     """
@@ -43,12 +45,12 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
 
     def __init__(
         self, robot: str = "h1", tasks: Sequence[TaskLike] = (), difficulty: str = "easy", image_size: int = 112,
-        render_mode: str | None = None,
+        render_mode: str | None = None, contingency: str = "default",
     ) -> None:  # fmt: skip
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}; allowed: rgb_array")
         self.render_mode = render_mode
-        self._session = Session(robot, difficulty, image_size)
+        self._session = Session(robot, difficulty, image_size, contingency)
         self._tasks: tuple[TaskLike, ...] = tuple(tasks) or (FreePlay("kitchen_1", step_budget=50),)
         self._last: Observation | None = None
         self._invalid = 0

@@ -82,6 +82,7 @@ class EvalConfig:
         planner: who plans.
         robot: which robot acts.
         difficulty: success of low-level skills: easy 100 %, medium 50 %, hard 20 %, natural as the rules say.
+        contingencies: outcome distributions, a name of `configs/contingency` or of one's own assets.
         category: tasks of one category, or all.
         trials: episodes per task; the luck and the random streams differ between trials.
         start: `fixed` starts where the task says, `turned` there with a heading drawn per trial.
@@ -97,6 +98,7 @@ class EvalConfig:
     planner: PlannerConfig
     robot: RobotConfig
     difficulty: DifficultyName = "easy"
+    contingencies: str = "default"
     category: CategoryName = "all"
     trials: int = 1
     start: StartName = "fixed"

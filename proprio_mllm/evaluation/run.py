@@ -34,6 +34,7 @@ from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWor
 from proprio_mllm.planners.file_planner import source_digest, split_source
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.planners.registry import make_planner
+from sim.contingency import load_contingency
 from sim.robots.spec import load_robot
 from sim.tasks.task import Task, load_benchmark, read_tasks
 
@@ -106,6 +107,7 @@ def config_hash(cfg: EvalConfig, digest: str) -> str:
     for name in ("label", "train", "weights", "source"):
         del planner[name]
     decides = {"planner": planner, "weights": digest, "robot": dataclasses.asdict(cfg.robot), "start": cfg.start}
+    decides["contingencies"] = hashlib.sha256(repr(load_contingency(cfg.contingencies)).encode()).hexdigest()
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -143,6 +145,8 @@ def run_folder(cfg: EvalConfig, digest: str) -> Path:
         parts.append(f"trials{cfg.trials}")
     if cfg.limit is not None:
         parts.append(f"limit{cfg.limit}")
+    if cfg.contingencies != "default":
+        parts.append(cfg.contingencies)
     if cfg.start != "fixed":
         parts.append(cfg.start)
     if cfg.seed != 0:
@@ -160,6 +164,7 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileg
         "privileged": privileged,
         "robot": cfg.robot.name,
         "difficulty": cfg.difficulty,
+        "contingencies": cfg.contingencies,
         "category": cfg.category,
         "trials": cfg.trials,
         "limit": cfg.limit,
@@ -202,7 +207,8 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
     Raises:
         WeightsError: when the planner's weights are absent.
         PlannerFileError: when the planner cannot be made from its file.
-        ValueError: when there is no task to run, the robot's description is wrong, or `robot.mjcf` is given.
+        ValueError: when there is no task to run, the robot's description is wrong, `robot.mjcf` is given, or the contingency is
+            unknown.
     """
     if cfg.robot.mjcf is not None:
         raise ValueError(
@@ -222,7 +228,7 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
         missing = [job for job, key in zip(jobs, wanted, strict=True) if key not in done]
         if len(missing) < len(jobs):
             logger.info("%d of %d episodes are already in %s", len(jobs) - len(missing), len(jobs), path)
-        setup = WorkerSetup(planner, cfg.difficulty, cfg.start)
+        setup = WorkerSetup(planner, cfg.difficulty, cfg.start, cfg.contingencies)
         make = functools.partial(EpisodeWorker, setup) if opener is None else functools.partial(EpisodeWorker, setup, opener)
         # Long episodes first, so that the workers finish together.
         order = sorted(missing, key=lambda job: -job.task.step_budget)

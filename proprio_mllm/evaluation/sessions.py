@@ -17,7 +17,7 @@ from sim.tasks.task import Task
 
 __all__ = ["SimSession", "open_session", "started"]
 
-_sessions: dict[tuple[RobotConfig, str, int], Session] = {}
+_sessions: dict[tuple[RobotConfig, str, int, str], Session] = {}
 
 
 def started(task: Task, start: StartName, luck: int) -> Task:
@@ -85,7 +85,14 @@ class SimSession:
 
 
 def open_session(
-    robot: RobotConfig, difficulty: DifficultyName, start: StartName, task: Task, luck: int, planner: Planner
+    robot: RobotConfig,
+    difficulty: DifficultyName,
+    start: StartName,
+    task: Task,
+    luck: int,
+    planner: Planner,
+    *,
+    contingency: str = "default",
 ) -> RunnableSession:
     """A session for an episode; a privileged planner is attached to it.
 
@@ -96,10 +103,11 @@ def open_session(
         task: the benchmark's task.
         luck: the episode's seed.
         planner: who plans.
+        contingency: outcome distributions.
     """
-    key = (robot, difficulty, planner.image_size)
+    key = (robot, difficulty, planner.image_size, contingency)
     if key not in _sessions:
-        _sessions[key] = Session(_described(robot), difficulty, planner.image_size)
+        _sessions[key] = Session(_described(robot), difficulty, planner.image_size, contingency)
     session = _sessions[key]
     if planner.privileged:
         from proprio_mllm.evaluation.privileged import ExpertPlanner

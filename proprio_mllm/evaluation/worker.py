@@ -33,11 +33,13 @@ class WorkerSetup:
         planner: who plans.
         difficulty: success of low-level skills.
         start: see `EvalConfig.start`.
+        contingency: see `EvalConfig.contingencies`.
     """
 
     planner: PlannerConfig
     difficulty: DifficultyName
     start: StartName
+    contingency: str = "default"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +76,7 @@ Opener = Callable[[WorkerSetup, EpisodeJob, Planner], RunnableSession]
 def _open(setup: WorkerSetup, job: EpisodeJob, planner: Planner) -> RunnableSession:
     from proprio_mllm.evaluation.sessions import open_session  # physics and rendering load only where they run
 
-    return open_session(job.robot, setup.difficulty, setup.start, job.task, job.luck, planner)
+    return open_session(job.robot, setup.difficulty, setup.start, job.task, job.luck, planner, contingency=setup.contingency)
 
 
 class EpisodeWorker:

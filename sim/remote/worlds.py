@@ -25,7 +25,7 @@ _LOG = logging.getLogger(__name__)
 
 #: Arguments of `Controller` that a client may give.
 CONTROLLER_ARGUMENTS = (
-    "robot_type", "scene", "width", "height", "difficulty", "seed", "third_party_cameras", "privileged",
+    "robot_type", "scene", "width", "height", "difficulty", "contingency", "seed", "third_party_cameras", "privileged",
 )  # fmt: skip
 
 

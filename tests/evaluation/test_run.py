@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import configs
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
 from data.records import Outcome
@@ -170,3 +171,29 @@ def test_killed_and_resumed_gives_the_same_table(tmp_path) -> None:
     assert len(read_ledger(ledger)) == len(read_ledger(other)) == 24
     for name in ("table.md", "table.csv"):
         assert (ledger.parent / name).read_text() == (other.parent / name).read_text()
+
+
+def test_contingencies_of_ones_own_are_other_results(cfg, session, tmp_path, monkeypatch) -> None:
+    folder = tmp_path / "assets" / "contingency"
+    folder.mkdir(parents=True)
+    rules = (Path(configs.__file__).parent / "contingency" / "default.yaml").read_text()
+    (folder / "unlucky.yaml").write_text(rules)
+    monkeypatch.setenv("DUALTHOR_ASSETS", str(folder.parent))
+    setups = []
+
+    def opener(setup, job, planner):
+        setups.append(setup.contingency)
+        return session()
+
+    evaluate(cfg, opener)
+    other = dataclasses.replace(cfg, contingencies="unlucky")
+    run = evaluate(other, opener)
+    assert set(setups[:4]) == {"default"}
+    assert set(setups[4:]) == {"unlucky"}
+    assert "unlucky" in run.folder.name
+    assert json.loads((run.folder / "run.json").read_text())["contingencies"] == "unlucky"
+    before = plan_episodes(other, select_tasks(other), "")[0].fields.config_hash
+    (folder / "unlucky.yaml").write_text(rules.replace("easy: 1.0", "easy: 0.9"))
+    assert plan_episodes(other, select_tasks(other), "")[0].fields.config_hash != before
+    with pytest.raises(ValueError, match=r"no contingency config 'nope'; allowed: default, unlucky"):
+        evaluate(dataclasses.replace(cfg, contingencies="nope"), opener)
