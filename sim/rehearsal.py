@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-import mujoco
 import numpy as np
 
-from data.records import Action, Arm
+from data.records import Action
 from sim.navigation import Stance
 from sim.session import Session
 from sim.skills.locomotion import best_stance
@@ -86,20 +85,4 @@ class Rehearsal:
 
     def _put(self, stance: Stance, height_m: float) -> None:
         """Moves robot and load rigidly; the legs follow the height."""
-        world, body = self._session.world, self._session.body
-        model, data = world.model, world.data
-        names = {arm: world.held(arm.value) for arm in Arm}
-        loads = {name: arm for arm, name in names.items() if name is not None and world.objects[name].movable}
-        hands = {arm: world.grasp_pose(arm.value) for arm in loads.values()}
-        poses = {name: world.pose(name) for name in loads}
-        body.command_base(stance.x, stance.y, stance.yaw_rad)
-        body.command_height(height_m)
-        for joint in (*body.spec.leg_joints, "base_x", "base_y", "base_z", "base_yaw", "base_pitch"):
-            data.qpos[model.joint(joint).qposadr[0]] = data.ctrl[model.actuator(joint).id]
-        mujoco.mj_kinematics(model, data)
-        for name, arm in loads.items():
-            pose = world.grasp_pose(arm.value) @ np.linalg.inv(hands[arm]) @ poses[name]
-            adr = world.objects[name].qpos_adr
-            data.qpos[adr : adr + 3] = pose[:3, 3]
-            mujoco.mju_mat2Quat(data.qpos[adr + 3 : adr + 7], pose[:3, :3].ravel())
-        mujoco.mj_kinematics(model, data)
+        self._session.world.put_base(stance.x, stance.y, stance.yaw_rad, height_m)
