@@ -1,8 +1,8 @@
 """Open, Close, ToggleOn, ToggleOff: hands on handles and switches.
 
 The hand goes to the handle until it touches it, then leads it along the door's arc or the drawer's slide; a ball joint at the
-grasp stands for the fingers around the bar. Where the arm cannot follow all the way, the robot steps back with it. A hinged door
-is shut by pushing its outside (`sim.skills.push`), by its handle only where that does not work. What counts is the joint's
+grasp stands for the fingers around the bar. Where the arm cannot follow all the way, the robot steps back with it. A hinged
+door is shut by pushing its outside (`sim.skills.push`), by its handle only where that does not work. What counts is the joint's
 position afterwards. A switch flips when a finger touches it.
 
 Paper: Open and Toggle of the DualTHOR action space; Close is ours.

@@ -20,7 +20,7 @@ from sim.world import World
 if TYPE_CHECKING:
     from sim.skills.body import Body
 
-__all__ = ["TOUCH_M", "ClearanceProbe"]
+__all__ = ["TOUCH_M", "AtDoor", "ClearanceProbe"]
 
 Array = NDArray[np.float64]
 
@@ -50,6 +50,23 @@ class _Cargo:
         mujoco.mj_kinematics(model, data)
 
 
+@dataclass(frozen=True, slots=True)
+class AtDoor:
+    """An arm beside a door or drawer.
+
+    Attributes:
+        gap_m: signed distance between forearm or hand and the part.
+        depth_m: deepest penetration of the arm into anything else.
+        bones: (3, 3) shoulder, elbow and grasp site, world frame.
+        hand: (N, 3) centres of the hand's geoms, world frame.
+    """
+
+    gap_m: float
+    depth_m: float
+    bones: Array
+    hand: Array
+
+
 class ClearanceProbe:
     """Collision questions about arm postures."""
 
@@ -63,6 +80,7 @@ class ClearanceProbe:
             arm: np.array([int(model.joint(n).qposadr[0]) for n in body.spec.arms[arm.value].joints]) for arm in Arm
         }
         self._limbs = {arm: sorted(_limb_geoms(model, body.spec.arms[arm.value].joints[0])) for arm in Arm}
+        self._hands = {arm: np.array([geom for geom in self._limbs[arm] if not _is_forearm(model, geom)]) for arm in Arm}
         self._base_adr = [int(model.joint(name).qposadr[0]) for name in ("base_x", "base_y", "base_yaw")]
         self._waist_adr = [int(model.joint(name).qposadr[0]) for name in body.spec.waist_joints]
         self._bones = {
@@ -155,19 +173,15 @@ class ClearanceProbe:
         if stance is not None:
             qpos[self._base_adr] = stance.x, stance.y, stance.yaw_rad
 
-    def against_door(self, arm: Arm, posture: Array, part: MovingPart, position: float) -> tuple[float, float, Array]:
-        """How an arm with its fist closed stands to a door or drawer at some joint position.
-
-        Returns:
-            Signed gap between the arm and the part, deepest penetration of the arm into anything else but the part, and (3, 3)
-            world positions of shoulder, elbow and the other end of the forearm.
-        """
+    def against_door(self, arm: Arm, posture: Array, part: MovingPart, position: float, fist: bool = True) -> AtDoor:
+        """How an arm, with its fist closed or as it is, stands to a door or drawer at some joint position."""
         world, scratch, model = self._world, self._scratch, self._world.model
         self._copy_state()
         base = self._body.commanded_base()
         scratch.qpos[self._base_adr] = base.x, base.y, base.yaw_rad
         scratch.qpos[self._waist_adr] = self._body.commanded_waist()  # it sways for a while after a walk
-        self._shape_hand(arm, 0.0)
+        if fist:
+            self._shape_hand(arm, 0.0)
         scratch.qpos[self._arm_adr[arm]] = posture
         scratch.qpos[part.qpos_adr] = position
         mujoco.mj_kinematics(model, scratch)
@@ -185,7 +199,8 @@ class ClearanceProbe:
         counts = (touching[a] != touching[b]) & barred[np.where(touching[a], b, a)]
         depth = max(0.0, float(-np.min(scratch.contact.dist[: scratch.ncon][counts], initial=0.0)))
         site = int(model.site(self._body.spec.arms[arm.value].grasp_site).id)
-        return gap, depth, np.stack([*scratch.xpos[self._bones[arm]], scratch.site_xpos[site]])
+        bones = np.stack([*scratch.xpos[self._bones[arm]], scratch.site_xpos[site]])
+        return AtDoor(gap, depth, bones, scratch.geom_xpos[self._hands[arm]].copy())
 
     def _cargo(self, arm: Arm) -> _Cargo | None:
         """What the arm alone holds, as it lies in the hand now."""
@@ -246,3 +261,7 @@ def _limb_geoms(model: mujoco.MjModel, joint: str) -> frozenset[int]:
         np.isin(model.geom_bodyid, sorted(below)) & ((model.geom_contype > 0) | (model.geom_conaffinity > 0))
     )
     return frozenset(int(index) for index in geoms)
+
+
+def _is_forearm(model: mujoco.MjModel, geom: int) -> bool:
+    return str(model.geom(geom).name).endswith("forearm")

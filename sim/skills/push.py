@@ -21,7 +21,7 @@ from sim.failures import FailureCode, SkillFailure
 from sim.navigation import Stance
 from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import ArmGoal, Body, wait
-from sim.skills.clearance import TOUCH_M
+from sim.skills.clearance import TOUCH_M, AtDoor
 from sim.skills.locomotion import step_to
 from sim.skills.manipulate import GRASP_GAP_M, stow
 from sim.skills.obstacles import navigation_map
@@ -61,10 +61,15 @@ _NEAR, _FAR = 0.45, 0.85
 _KEPT: Final = 80
 _QUERIED: Final = 60
 _SOLVED: Final = 5
-#: Upper limit of solved stances in one plan.
+#: Upper limit of solved stances in one plan, and in one that is made for another pelvis height to explain a failure.
 _TRIALS: Final = 14
+_TRIALS_EXPLAINING: Final = 4
+#: Room between the hands and the door before anything moves.
+_HAND_ROOM_M: Final = 0.004
 #: Thickness of an upper arm or forearm around its bone.
 _BONE_M: Final = 0.035
+#: Length of a hand before its wrist, measured from the grasp site.
+_HAND_M: Final = 0.14
 #: Turn of the door from which on the fist has met it.
 _NUDGED_RAD: Final = 0.02
 #: Peak speed of the free edge, m/s.
@@ -152,15 +157,20 @@ class Door:
         outside_v = np.maximum(np.maximum(self.back_m - v, v - self.face_m), 0.0)
         return np.hypot(outside_u, outside_v)
 
-    def pierced(self, bones: Array, position: float) -> bool:
-        """Whether the arm whose shoulder, elbow and hand are at `bones` (3, 3) would pass through the door."""
+    def outside(self, state: AtDoor, position: float) -> bool:
+        """Whether the hand is before the door and neither forearm nor upper arm passes through it."""
+        if float(np.min((state.hand - self.anchor) @ self.normal(position))) < self.face_m:
+            return False
+        shoulder, elbow, site = state.bones
+        forearm = float(np.linalg.norm(site - elbow))
+        wrist = elbow + (site - elbow) * max(forearm - _HAND_M, 0.0) / max(forearm, 1e-9)  # the hand itself touches the door
         shares = np.linspace(0.0, 1.0, 15)[:, None]
-        line = np.concatenate([bones[0] + shares * (bones[1] - bones[0]), bones[1] + shares * (bones[2] - bones[1])])
+        line = np.concatenate([shoulder + shares * (elbow - shoulder), elbow + shares * (wrist - elbow)])
         delta = line - self.anchor
         u, v = delta @ self.along(position), delta @ self.normal(position)
         inside = (u > -0.05) & (u < self.width_m + _BONE_M) & (v > self.back_m - _BONE_M) & (v < self.face_m + 0.4 * _BONE_M)
         inside &= (line[:, 2] > self.heights[0] - _BONE_M) & (line[:, 2] < self.heights[1] + _BONE_M)
-        return bool(np.any(inside))
+        return not bool(np.any(inside))
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +202,7 @@ def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> 
     count = 2 + int(np.ceil(abs(door.now - goal) / _STEP_RAD))
     positions = np.linspace(door.now, goal, count)
     shoulder_m = float(body.shoulder(arm)[2])
-    trials = 0
+    trials = _TRIALS if body.considered_height_m is None else _TRIALS_EXPLAINING
     seen: set[tuple[float, float]] = set()
     for share, rise in _SPOTS:
         height = float(np.clip(shoulder_m + rise, door.heights[0] + 0.06, door.heights[1] - 0.06))
@@ -201,9 +211,9 @@ def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> 
             continue
         seen.add(spot)
         for stances in _stances(body, arm, door, spot, positions)[:_SOLVED]:
-            trials += 1
-            if trials > _TRIALS:
+            if trials == 0:
                 return None
+            trials -= 1
             push = _solve(body, arm, door, spot, positions, stances)
             if push is not None:
                 return push
@@ -281,7 +291,7 @@ def _grid(door: Door, base: Stance, site: Array) -> Array:
 
 
 def _strain(body: Body, arm: Arm, poses: Array, sites: Array) -> Array:
-    """(M,) metres by which the hand at (M, 3) sites would be too close to the shoulder or too far from it, infinite out of reach."""
+    """(M,) metres by which a hand at (M, 3) sites is too close to the shoulder or too far from it, infinite out of reach."""
     shoulder, reach = body.maps[arm.value].shoulder, body.maps[arm.value].reach_m
     local = _shoulders(body, arm, poses)
     delta = sites - local
@@ -330,6 +340,10 @@ def _wrapped(angle: Array) -> Array:
 def _solve(body: Body, arm: Arm, door: Door, spot: tuple[float, float], positions: Array, stances: Array) -> Push | None:
     """The arm's postures along the way, None when it cannot follow or would collide."""
     base = body.commanded_base()
+    with body.considering_stance(Stance(*map(float, stances[0]))):  # a hand that is at the door already would move it
+        states = [body.probe.against_door(a, body.commanded_arm(a), door.part, door.now, fist=False) for a in Arm]
+    if min(state.gap_m for state in states) < _HAND_ROOM_M:
+        return None
     for wish in _directions(body, arm, door, spot, float(positions[0]), Stance(*map(float, stances[0]))):
         postures: list[Array] = []
         out_m = _FIST_M
@@ -393,21 +407,14 @@ def _at_face(
             goal = body.solve(arm, HandPose(door.point(position, *spot, out_m), pointing), start)
             if goal.error_m > 0.025:
                 return None
-            gap, depth, bones = body.probe.against_door(arm, goal.q, door.part, position)
-            if depth > TOUCH_M:
+            state = body.probe.against_door(arm, goal.q, door.part, position)
+            if state.depth_m > TOUCH_M:
                 return None
-            if abs(gap + _PRESS_M) <= _PRESS_SLACK_M:
-                return None if door.pierced(_arm_line(bones), position) else (goal.q, out_m)
-            out_m = float(np.clip(out_m - (gap + _PRESS_M), -0.02, 0.2))
+            if abs(state.gap_m + _PRESS_M) <= _PRESS_SLACK_M:
+                return (goal.q, out_m) if door.outside(state, position) else None
+            out_m = float(np.clip(out_m - (state.gap_m + _PRESS_M), -0.02, 0.2))
             start = goal.q
     return None
-
-
-def _arm_line(bones: Array) -> Array:
-    """Shoulder, elbow, and a point short of the hand, which itself touches the door."""
-    forearm = bones[2] - bones[1]
-    length = float(np.linalg.norm(forearm))
-    return np.stack([bones[0], bones[1], bones[1] + forearm * max(length - 0.14, 0.0) / max(length, 1e-9)])
 
 
 def _approach(body: Body, arm: Arm, door: Door, spot: tuple[float, float], position: float, at: Array) -> Reach | None:
@@ -424,7 +431,7 @@ def _approach(body: Body, arm: Arm, door: Door, spot: tuple[float, float], posit
             continue
         steps = [before.q + share * (at - before.q) for share in (0.0, 0.25, 0.5, 0.75)]
         states = [body.probe.against_door(arm, q, door.part, position) for q in steps]
-        if any(gap < -_PRESS_M or depth > TOUCH_M or door.pierced(_arm_line(b), position) for gap, depth, b in states):
+        if any(s.gap_m < -_PRESS_M or s.depth_m > TOUCH_M or not door.outside(s, position) for s in states):
             continue
         way = _route(body, arm, door, spot, position, before.q)
         if way is not None:
