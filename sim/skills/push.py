@@ -66,6 +66,8 @@ _TRIALS: Final = 14
 _TRIALS_EXPLAINING: Final = 4
 #: Room between the hands and the door before anything moves.
 _HAND_ROOM_M: Final = 0.004
+#: The same for a hand behind the door: its fingers would hook the door as they close.
+_FINGERS_M: Final = 0.035
 #: Thickness of an upper arm or forearm around its bone.
 _BONE_M: Final = 0.035
 #: Length of a hand before its wrist, measured from the grasp site.
@@ -157,9 +159,13 @@ class Door:
         outside_v = np.maximum(np.maximum(self.back_m - v, v - self.face_m), 0.0)
         return np.hypot(outside_u, outside_v)
 
+    def before(self, state: AtDoor, position: float) -> bool:
+        """Whether the whole hand is on the outer side of the door."""
+        return float(np.min((state.hand - self.anchor) @ self.normal(position))) >= self.face_m
+
     def outside(self, state: AtDoor, position: float) -> bool:
         """Whether the hand is before the door and neither forearm nor upper arm passes through it."""
-        if float(np.min((state.hand - self.anchor) @ self.normal(position))) < self.face_m:
+        if not self.before(state, position):
             return False
         shoulder, elbow, site = state.bones
         forearm = float(np.linalg.norm(site - elbow))
@@ -342,7 +348,7 @@ def _solve(body: Body, arm: Arm, door: Door, spot: tuple[float, float], position
     base = body.commanded_base()
     with body.considering_stance(Stance(*map(float, stances[0]))):  # a hand that is at the door already would move it
         states = [body.probe.against_door(a, body.commanded_arm(a), door.part, door.now, fist=False) for a in Arm]
-    if min(state.gap_m for state in states) < _HAND_ROOM_M:
+    if any(state.gap_m < (_HAND_ROOM_M if door.before(state, door.now) else _FINGERS_M) for state in states):
         return None
     for wish in _directions(body, arm, door, spot, float(positions[0]), Stance(*map(float, stances[0]))):
         postures: list[Array] = []
