@@ -76,6 +76,8 @@ _HAND_M: Final = 0.14
 _NUDGED_RAD: Final = 0.02
 #: Peak speed of the free edge, m/s.
 _EDGE_SPEED: Final = 0.4
+#: How much deeper than in its push a fist may come to a door while it is drawn back.
+_CATCH_M: Final = 0.004
 #: How far a posture may be from the one before.
 _JUMP_RAD: Final = 0.9
 
@@ -189,6 +191,7 @@ class Push:
         positions: (N,) joint positions along the way.
         postures: (N, A) arm joints that go with them.
         stances: (N, 3) base poses (x, y, yaw) that go with them.
+        away: (2, A) postures with which the fist is drawn back from the shut door.
         way: (M, 2) polyline to the first stance, None when the robot already stands there.
     """
 
@@ -197,6 +200,7 @@ class Push:
     positions: Array
     postures: Array
     stances: Array
+    away: Array
     way: Array | None
 
 
@@ -365,6 +369,9 @@ def _solve(body: Body, arm: Arm, door: Door, spot: tuple[float, float], position
             postures.append(q)
         if len(postures) < len(positions):
             continue
+        away = _away(body, arm, door, positions, np.stack(postures), Stance(*map(float, stances[-1])))
+        if away is None:
+            continue
         first = Stance(*map(float, stances[0]))
         with body.considering_stance(first):
             reach = _approach(body, arm, door, spot, float(positions[0]), postures[0])
@@ -376,7 +383,7 @@ def _solve(body: Body, arm: Arm, door: Door, spot: tuple[float, float], position
         way = body.navigation().ways(base.position).to(first.position) if moves > 1e-3 else None
         if moves > 1e-3 and way is None:
             return None
-        return Push(reach, door.part, positions, np.stack(postures), stances, way)
+        return Push(reach, door.part, positions, np.stack(postures), stances, away, way)
     return None
 
 
@@ -421,6 +428,20 @@ def _at_face(
             out_m = float(np.clip(out_m - (state.gap_m + _PRESS_M), -0.02, 0.2))
             start = goal.q
     return None
+
+
+def _away(body: Body, arm: Arm, door: Door, positions: Array, postures: Array, stance: Stance) -> Array | None:
+    """The postures after the push: at the shut door and away from it; None when the fist would catch the handle on the way."""
+    shut = door.part.range[0]
+    order = np.argsort(positions, kind="stable")
+    at = np.array([np.interp(shut, positions[order], column[order]) for column in postures.T])
+    with body.considering_stance(stance):
+        goal = body.solve(arm, HandPose(body.hand_at(arm, at) + _BEFORE_M * door.normal(shut)), start=at)
+        if goal.error_m > 0.04:
+            return None
+        states = [body.probe.against_door(arm, at + s * (goal.q - at), door.part, shut) for s in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)]
+    caught = any(state.gap_m < min(states[0].gap_m, 0.0) - _CATCH_M for state in states)
+    return None if caught else np.stack([at, goal.q])
 
 
 def _approach(body: Body, arm: Arm, door: Door, spot: tuple[float, float], position: float, at: Array) -> Reach | None:
@@ -487,11 +508,11 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
     gap = body.probe.limb_gap_m(arm, panel)
     moved = abs(float(body.world.data.qpos[part.qpos_adr]) - float(push.positions[0]))
     if gap > GRASP_GAP_M and moved < _NUDGED_RAD:
-        yield from _draw_back(body, arm, push, action.object_id)
+        yield from _draw_back(body, arm, push.reach.before[None])
         raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": gap})
     if outcome != "success":
         yield from wait(0.2)
-        yield from _draw_back(body, arm, push, action.object_id)
+        yield from _draw_back(body, arm, push.reach.before[None])
         code = FailureCode.LOCKED if outcome == "locked" else FailureCode.NOTHING_HAPPENED
         raise SkillFailure(code, contingency=outcome)
     shares = np.linspace(0.0, 1.0, len(push.positions))
@@ -504,15 +525,11 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
         body.command_base(*(float(np.interp(s, shares, column)) for column in stances.T))
         yield
     yield from wait(0.2)
-    yield from _draw_back(body, arm, push, action.object_id)
+    yield from _draw_back(body, arm, push.away)
 
 
-def _draw_back(body: Body, arm: Arm, push: Push, name: str) -> Skill:
+def _draw_back(body: Body, arm: Arm, away: Array) -> Skill:
     """Takes the fist off the face, straight out, and brings the arm home with an open hand."""
-    door = Door.of(body, body.thing(name), push.part)
-    hand, _ = body.hand_pose(arm)
-    away = body.solve(arm, HandPose(hand + _BEFORE_M * door.normal(door.now)), start=body.commanded_arm(arm))
-    if away.error_m < 0.04:
-        yield from body.move_arm(arm, [away.q])
+    yield from body.move_arm(arm, list(away))
     yield from body.move_hand(arm, 1.0, 0.2)
     yield from stow(body, arm)
