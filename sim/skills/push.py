@@ -40,6 +40,8 @@ _PAST_SHUT: Final = 0.04
 _STEP_RAD: Final = 0.16
 #: Where the fist may touch: shares of the way from hinge to free edge, and heights relative to the shoulder.
 _SPOTS: Final = ((0.88, -0.22), (0.72, -0.22), (0.88, -0.4), (0.88, -0.05), (0.58, -0.22), (0.72, -0.4))
+#: Half the width of a fist, with some room.
+_FIST_HALF_M: Final = 0.075
 #: Depth to which the fist is commanded into the door that it moves, and how exactly.
 _PRESS_M: Final = 0.006
 _PRESS_SLACK_M: Final = 0.006
@@ -213,13 +215,7 @@ def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> 
     positions = np.linspace(door.now, goal, count)
     shoulder_m = float(body.shoulder(arm)[2])
     trials = _TRIALS if body.considered_height_m is None else _TRIALS_EXPLAINING
-    seen: set[tuple[float, float]] = set()
-    for share, rise in _SPOTS:
-        height = float(np.clip(shoulder_m + rise, door.heights[0] + 0.06, door.heights[1] - 0.06))
-        spot = (share * door.width_m, height)
-        if spot in seen:
-            continue
-        seen.add(spot)
+    for spot in _spots(body, door, shoulder_m):
         for stances in _stances(body, arm, door, spot, positions)[:_SOLVED]:
             if trials == 0:
                 return None
@@ -228,6 +224,25 @@ def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> 
             if push is not None:
                 return push
     return None
+
+
+def _spots(body: Body, door: Door, shoulder_m: float) -> list[tuple[float, float]]:
+    """Where the fist may touch, as distances from the hinge and heights: beside the handle first, which would catch it."""
+    model, data = body.world.model, body.world.data
+    low, high = door.heights
+    clear: list[tuple[float, float]] = []
+    at_handle: list[tuple[float, float]] = []
+    handle = data.site_xpos[door.part.handle_site] if door.part.handle_site >= 0 else None
+    geoms = np.flatnonzero((model.geom_bodyid == door.part.body_id) & (model.geom_contype > 0))
+    half_m = min((float(model.geom_aabb[geom, 5]) for geom in geoms), default=0.0)  # the handle is lower than the panel
+    for share, rise in _SPOTS:
+        spot = (share * door.width_m, float(np.clip(shoulder_m + rise, low + 0.06, high - 0.06)))
+        beside = handle is None or abs(float((handle - door.anchor) @ door.along(door.now)) - spot[0]) > _FIST_HALF_M
+        above = handle is None or abs(float(handle[2]) - spot[1]) > half_m + _FIST_HALF_M
+        rank = clear if beside or above else at_handle
+        if spot not in clear and spot not in at_handle:
+            rank.append(spot)
+    return clear + at_handle
 
 
 # ---- stances
