@@ -62,7 +62,7 @@ _NEAR, _FAR = 0.45, 0.85
 #: Pairs of stances that get this far in the search, by stage.
 _KEPT: Final = 80
 _QUERIED: Final = 60
-_SOLVED: Final = 5
+_SOLVED: Final = 3
 #: Upper limit of solved stances in one plan, and in one that is made for another pelvis height to explain a failure.
 _TRIALS: Final = 14
 _TRIALS_EXPLAINING: Final = 4
