@@ -257,7 +257,8 @@ class Body:
             if not carriers:
                 return ()
             square = self.thing(carriers[-1])
-        front = self.world.front(square.object_id)
+        # a tap may stand beside its basin, which is used from the basin's front
+        front = self.world.front(self.world.room.links.get(square.object_id, square.object_id))
         angle = float(np.arctan2(front[1], front[0]))
         sides = square.movable or any(surface.spec.all_sides for surface in square.surfaces)
         return tuple(angle + k * np.pi / 2.0 for k in range(4)) if sides else (angle,)

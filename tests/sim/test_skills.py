@@ -157,6 +157,18 @@ def test_a_switch_is_pressed(session):
 
 
 @pytest.mark.parametrize(
+    ("room", "counter"), [("kitchen_2", ("CounterTop_1", (-0.6, 2.1))), ("bathroom_1", ("CounterTop_1", (0.2, 1.42)))]
+)
+def test_a_tap_beside_its_basin_fills_a_mug(session, room, counter):
+    start(session, FreePlay(room, placements=(ObjectPlacement("Mug_1", *counter),)))
+    assert reach(session, "ToggleOn(left, Faucet_1)").success and session.world.objects["Faucet_1"].is_toggled
+    arm = {"x1": "left", "h1": "right"}[session.robot.name]
+    assert reach(session, f"Pick({arm}, Mug_1)").success
+    assert reach(session, f"Fill({arm}, Faucet_1)").success
+    assert session.world.objects["Mug_1"].state.fillLitres > 0.1
+
+
+@pytest.mark.parametrize(
     ("text", "code"),
     [
         ("Pick(left, Fridge_1)", "NotPickupable"),
