@@ -205,9 +205,16 @@ class Push:
     away: Array
     way: Array | None
 
+    @property
+    def walks(self) -> bool:
+        """Whether the base moves at all."""
+        return self.way is not None or bool(np.any(np.ptp(self.stances, axis=0) > 1e-6))
+
 
 def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> Push | None:
     """How one arm shuts a door by pushing, with as little walking as possible; None when no way was found."""
+    if any(name is not None and not body.thing(name).movable for name in body.held.values()):
+        return None  # a hand at another door or drawer: walking would tear at it
     door = Door.of(body, thing, part)
     low, high = part.range
     goal = low - _PAST_SHUT * (high - low)

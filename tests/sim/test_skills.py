@@ -109,6 +109,14 @@ def test_a_door_that_stands_open_is_pushed_shut(session, door):
     assert act(session, f"Close(left, {door})")[0].code in ("AlreadyInState", "")
 
 
+def test_a_push_that_walks_has_no_company(session):
+    start(session, FreePlay("kitchen_1", states={"Cabinet_1": {"isOpen": True}}, placements=THINGS))
+    act(session, "GoTo(Cabinet_1)")
+    assert assess_open_close(session.body, Action.parse("Close(left, Cabinet_1)")).walks
+    codes = [outcome.code for outcome in act(session, "Close(left, Cabinet_1) & ResetArm(right)")]
+    assert codes == ["ArmConflict", "ArmConflict"]
+
+
 def test_what_a_robot_opens_it_closes_again(session):
     start(session)
     assert reach(session, "Open(left, Microwave_1)").success
