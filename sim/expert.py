@@ -21,6 +21,7 @@ from sim.failures import FailureCode, SkillFailure
 from sim.navigation import Stance, wrap_angle
 from sim.rehearsal import HEIGHT_STEP_M, Rehearsal
 from sim.session import Session
+from sim.skills.registry import excludes
 from sim.tasks.jobs import Facts, Job, plan_jobs
 from sim.tasks.predicates import Predicate
 
@@ -255,9 +256,15 @@ class Expert:
                 first, second = head.action(mine), job.action(other)
                 if any(self._refused_here(action) for action in (first, second)):
                     continue
-                if all(self._session.assess(action) is None for action in (second, first)):
+                if all(self._session.assess(action) is None for action in (second, first)) and not self._excluded(
+                    first, second
+                ):
                     return PlanStep((first, second))
         return _single(head.action(arm))
+
+    def _excluded(self, first: Action, second: Action) -> bool:
+        """Whether two actions that are possible alone exclude each other: one would walk away from the other."""
+        return excludes(self._session.body, PlanStep((first, second)), frozenset(self._session.known_objects))
 
     # ---- the body
 

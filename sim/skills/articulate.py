@@ -1,8 +1,9 @@
 """Open, Close, ToggleOn, ToggleOff: hands on handles and switches.
 
 The hand goes to the handle until it touches it, then leads it along the door's arc or the drawer's slide; a ball joint at the
-grasp stands for the fingers around the bar. Where the arm cannot follow all the way, the robot steps back with it. What counts
-is the joint's position afterwards. A switch flips when a finger touches it.
+grasp stands for the fingers around the bar. Where the arm cannot follow all the way, the robot steps back with it. A hinged
+door is shut by pushing its outside (`sim.skills.push`), by its handle only where that does not work. What counts is the joint's
+position afterwards. A switch flips when a finger touches it.
 
 Paper: Open and Toggle of the DualTHOR action space; Close is ours.
 """
@@ -13,6 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +25,7 @@ from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
+from sim.skills.push import Push, plan_push, push_shut
 from sim.skills.reach import Reach, explained, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
@@ -86,7 +89,7 @@ def _pointings(body: Body, arm: Arm, point: Array) -> Iterator[Array]:
 
 
 @remembered
-def assess_open_close(body: Body, action: Action) -> Pull:
+def assess_open_close(body: Body, action: Action) -> Pull | Push:
     """What Open or Close would do.
 
     Raises:
@@ -102,7 +105,13 @@ def assess_open_close(body: Body, action: Action) -> Pull:
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
     grip_m = body.spec.hand.tip_m - _PAST_BAR_M
 
-    def search() -> Pull:
+    hinged = int(body.world.model.jnt_type[part.joint_id]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+
+    def search() -> Pull | Push:
+        if hinged and not opening:
+            push = plan_push(body, arm, thing, part)
+            if push is not None:
+                return push
         best: Pull | None = None
         tried = 0
         for pointing in _pointings(body, arm, handle):
@@ -194,7 +203,10 @@ def open_close(body: Body, action: Action, luck: Luck) -> Skill:
             break
         if not outcome:
             outcome = luck(action)
-        yield from _pull(body, action, pull, outcome)
+        if isinstance(pull, Push):
+            yield from push_shut(body, action, pull, outcome)
+        else:
+            yield from _pull(body, action, pull, outcome)
         if _share(body, pull.part) >= _OPEN_WELL if opening else _share(body, pull.part) <= _CLOSED_MAX:
             return
     if opening and _share(body, thing.moving[0]) >= _OPEN_MIN:

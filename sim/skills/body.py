@@ -132,6 +132,7 @@ class Body:
         self._mine = np.where(np.isin(model.geom_bodyid, list(world.robot_body_ids)), 1, -1)
         self._columns = {arm: kit.model.indices(self.spec.arms[arm.value].joints) for arm in Arm}
         self.considered_height_m: float | None = None
+        self.considered_stance: Stance | None = None
         #: Whether a refusal may stay unexplained: no other pelvis heights are tried to find its reason.
         self.hurried = False
         self._vias: dict[Arm, tuple[Array, ...]] = {}
@@ -146,7 +147,7 @@ class Body:
             for thing in self.world.objects.values()
         )
         numbers = (data.qpos.tobytes(), data.ctrl.tobytes(), data.xpos.tobytes())
-        return *numbers, things, self.considered_height_m, self.hurried
+        return *numbers, things, self.considered_height_m, self.considered_stance, self.hurried
 
     # ---- base and legs
 
@@ -156,7 +157,9 @@ class Body:
         return Stance(float(x), float(y), float(yaw))
 
     def commanded_base(self) -> Stance:
-        """Where the base is told to be."""
+        """Where the base is told to be, or the stance that is being considered."""
+        if self.considered_stance is not None:
+            return self.considered_stance
         x, y, _, yaw = self.world.data.ctrl[self._base[:4]]
         return Stance(float(x), float(y), float(yaw))
 
@@ -174,6 +177,16 @@ class Body:
             yield
         finally:
             self.considered_height_m = before
+
+    @contextmanager
+    def considering_stance(self, stance: Stance) -> Iterator[None]:
+        """Within the block every geometric answer is for another stance; nothing moves."""
+        before = self.considered_stance
+        self.considered_stance = stance
+        try:
+            yield
+        finally:
+            self.considered_stance = before
 
     def base_error_m(self) -> float:
         """Distance between commanded and actual base, the heading weighed with 0.3 m per radian."""
@@ -285,7 +298,8 @@ class Body:
             if not carriers:
                 return ()
             square = self.thing(carriers[-1])
-        front = self.world.front(square.object_id)
+        # a tap may stand beside its basin, which is used from the basin's front
+        front = self.world.front(self.world.room.links.get(square.object_id, square.object_id))
         angle = float(np.arctan2(front[1], front[0]))
         sides = square.movable or any(surface.spec.all_sides for surface in square.surfaces)
         return tuple(angle + k * np.pi / 2.0 for k in range(4)) if sides else (angle,)

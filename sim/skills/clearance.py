@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Arm
+from sim.objects import MovingPart
 from sim.world import World
 
 if TYPE_CHECKING:
     from sim.skills.body import Body
 
-__all__ = ["TOUCH_M", "ClearanceProbe"]
+__all__ = ["TOUCH_M", "AtDoor", "ClearanceProbe"]
 
 Array = NDArray[np.float64]
 
@@ -49,6 +50,23 @@ class _Cargo:
         mujoco.mj_kinematics(model, data)
 
 
+@dataclass(frozen=True, slots=True)
+class AtDoor:
+    """An arm beside a door or drawer.
+
+    Attributes:
+        gap_m: signed distance between forearm or hand and the part.
+        depth_m: deepest penetration of the arm into anything else.
+        bones: (3, 3) shoulder, elbow and grasp site, world frame.
+        hand: (N, 3) centres of the hand's geoms, world frame.
+    """
+
+    gap_m: float
+    depth_m: float
+    bones: Array
+    hand: Array
+
+
 class ClearanceProbe:
     """Collision questions about arm postures."""
 
@@ -60,6 +78,14 @@ class ClearanceProbe:
         self._geoms = {arm: _limb_geoms(model, body.spec.arms[arm.value].joints[-2]) for arm in Arm}
         self._arm_adr = {
             arm: np.array([int(model.joint(n).qposadr[0]) for n in body.spec.arms[arm.value].joints]) for arm in Arm
+        }
+        self._limbs = {arm: sorted(_limb_geoms(model, body.spec.arms[arm.value].joints[0])) for arm in Arm}
+        self._hands = {arm: np.array([geom for geom in self._limbs[arm] if not _is_forearm(model, geom)]) for arm in Arm}
+        self._base_adr = [int(model.joint(name).qposadr[0]) for name in ("base_x", "base_y", "base_yaw")]
+        self._waist_adr = [int(model.joint(name).qposadr[0]) for name in body.spec.waist_joints]
+        self._bones = {
+            arm: [int(model.body(body.spec.key_bodies[f"{arm.value}_{name}"]).id) for name in ("shoulder", "elbow")]
+            for arm in Arm
         }
         self._height_adr = [int(model.joint(name).qposadr[0]) for name in ("base_z", "base_pitch")]
         self._couplings = [
@@ -111,10 +137,7 @@ class ClearanceProbe:
         for name, thing in world.objects.items():
             if thing.held_by or name in ignore:
                 allowed.update(map(int, thing.geom_ids))
-        scratch.qpos[:] = world.data.qpos
-        height = self._body.considered_height_m
-        if height is not None:
-            scratch.qpos[self._height_adr] = height, self._body.crouches.pitch(height)
+        self._copy_state()
         if opening is not None:
             self._shape_hand(arm, opening)
         mine = set(self._geoms[arm])
@@ -139,6 +162,45 @@ class ClearanceProbe:
             if depths[-1] - (0.0 if relief is None else depths[0] * relief[len(depths) - 1]) > limit_m:
                 break
         return np.array(depths)
+
+    def _copy_state(self) -> None:
+        """The world's state, with the stance and the pelvis height that are being considered."""
+        qpos, body = self._scratch.qpos, self._body
+        qpos[:] = self._world.data.qpos
+        height, stance = body.considered_height_m, body.considered_stance
+        if height is not None:
+            qpos[self._height_adr] = height, body.crouches.pitch(height)
+        if stance is not None:
+            qpos[self._base_adr] = stance.x, stance.y, stance.yaw_rad
+
+    def against_door(self, arm: Arm, posture: Array, part: MovingPart, position: float, fist: bool = True) -> AtDoor:
+        """How an arm, with its fist closed or as it is, stands to a door or drawer at some joint position."""
+        world, scratch, model = self._world, self._scratch, self._world.model
+        self._copy_state()
+        base = self._body.commanded_base()
+        scratch.qpos[self._base_adr] = base.x, base.y, base.yaw_rad
+        scratch.qpos[self._waist_adr] = self._body.commanded_waist()  # it sways for a while after a walk
+        if fist:
+            self._shape_hand(arm, 0.0)
+        scratch.qpos[self._arm_adr[arm]] = posture
+        scratch.qpos[part.qpos_adr] = position
+        mujoco.mj_kinematics(model, scratch)
+        limb, panel = self._limbs[arm], np.flatnonzero((model.geom_bodyid == part.body_id) & (model.geom_contype > 0))
+        gap = self._gap(scratch, limb, panel)
+        mujoco.mj_collision(model, scratch)
+        barred = np.ones(model.ngeom, dtype=bool)
+        barred[panel] = False
+        for thing in world.objects.values():
+            if thing.held_by:
+                barred[thing.geom_ids] = False
+        touching = np.zeros(model.ngeom, dtype=bool)
+        touching[limb] = True
+        a, b = scratch.contact.geom[: scratch.ncon].T
+        counts = (touching[a] != touching[b]) & barred[np.where(touching[a], b, a)]
+        depth = max(0.0, float(-np.min(scratch.contact.dist[: scratch.ncon][counts], initial=0.0)))
+        site = int(model.site(self._body.spec.arms[arm.value].grasp_site).id)
+        bones = np.stack([*scratch.xpos[self._bones[arm]], scratch.site_xpos[site]])
+        return AtDoor(gap, depth, bones, scratch.geom_xpos[self._hands[arm]].copy())
 
     def _cargo(self, arm: Arm) -> _Cargo | None:
         """What the arm alone holds, as it lies in the hand now."""
@@ -170,7 +232,14 @@ class ClearanceProbe:
 
     def gap_m(self, ours: NDArray[np.int64], theirs: NDArray[np.int64]) -> float:
         """Smallest distance between two sets of geoms."""
-        model, data = self._world.model, self._world.data
+        return self._gap(self._world.data, ours, theirs)
+
+    def limb_gap_m(self, arm: Arm, geoms: NDArray[np.int64]) -> float:
+        """Distance of forearm and hand to some geoms, in the world as it is."""
+        return self._gap(self._world.data, self._limbs[arm], geoms)
+
+    def _gap(self, data: mujoco.MjData, ours: Iterable[int], theirs: Iterable[int]) -> float:
+        model = self._world.model
         best = _FAR_M
         for a in ours:
             for b in theirs:
@@ -192,3 +261,7 @@ def _limb_geoms(model: mujoco.MjModel, joint: str) -> frozenset[int]:
         np.isin(model.geom_bodyid, sorted(below)) & ((model.geom_contype > 0) | (model.geom_conaffinity > 0))
     )
     return frozenset(int(index) for index in geoms)
+
+
+def _is_forearm(model: mujoco.MjModel, geom: int) -> bool:
+    return str(model.geom(geom).name).endswith("forearm")

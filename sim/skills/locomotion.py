@@ -22,7 +22,7 @@ from sim.skills.body import Body
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.trajectory import plan, plan_polyline
 
-__all__ = ["best_stance", "change_height", "go_to", "move", "rotate"]
+__all__ = ["best_stance", "change_height", "go_to", "move", "rotate", "step_to"]
 
 WALK_SPEED_M_S: Final = 0.9
 WALK_ACCELERATION_M_S2: Final = 2.0
@@ -129,6 +129,14 @@ def _settle(body: Body) -> Skill:
         if body.base_error_m() < 0.004:
             return
         yield
+
+
+def step_to(body: Body, path: NDArray[np.float64], yaw_rad: float) -> Skill:
+    """Sidesteps along a polyline (N, 2) to a stance close by, then turns into its heading."""
+    if float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) > 0.01:
+        yield from _walk(body, path, along=False)
+    yield from _turn(body, yaw_rad)
+    yield from _settle(body)
 
 
 def move(body: Body, action: Action) -> Skill:

@@ -25,8 +25,8 @@ _LYING_M: Final = 0.3
 _ROUND_M: Final = 0.01
 
 
-def obstacle_rectangles(world: World) -> tuple[Rectangle, ...]:
-    """Rectangles on the floor of all that the base must not run into, rounded to a centimetre."""
+def obstacle_rectangles(world: World, without: int = -1) -> tuple[Rectangle, ...]:
+    """Rectangles on the floor of all that the base must not run into, rounded to a centimetre, except one MuJoCo body."""
     model, data = world.model, world.data
     movable = {thing.body_id for thing in world.objects.values() if thing.held_by}
     found: set[Rectangle] = set()
@@ -35,7 +35,7 @@ def obstacle_rectangles(world: World) -> tuple[Rectangle, ...]:
         bits = int(model.geom_contype[geom])
         if bits not in (STATIC_BITS[0], MOVABLE_BITS[0]) or int(model.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_PLANE):
             continue
-        if body in movable:
+        if body in movable or body == without:
             continue
         rotation = data.geom_xmat[geom].reshape(3, 3)
         center = data.geom_xpos[geom] + rotation @ model.geom_aabb[geom, :3]
@@ -63,9 +63,9 @@ def _footprint(center: np.ndarray, rotation: np.ndarray, half: np.ndarray) -> Re
     return Rectangle((rounded(center[0]), rounded(center[1])), (rounded(hx), rounded(hy)), round(yaw, 2))
 
 
-def navigation_map(world: World, radius_m: float) -> NavigationMap:
-    """Free space of the base in a world."""
-    return _cached(world.room.bounds, obstacle_rectangles(world), radius_m)
+def navigation_map(world: World, radius_m: float, without: int = -1) -> NavigationMap:
+    """Free space of the base in a world, as if one MuJoCo body were not there."""
+    return _cached(world.room.bounds, obstacle_rectangles(world, without), radius_m)
 
 
 @lru_cache(maxsize=32)

@@ -10,9 +10,10 @@ from sim.failures import FailureCode, SkillFailure
 from sim.skills import articulate, holding, locomotion, manipulate, pouring, tools, two_arm
 from sim.skills.body import Body
 from sim.skills.manipulate import Luck
+from sim.skills.push import Push
 from sim.skills.runner import Skill, refuse
 
-__all__ = ["ARM_SKILLS", "BODY_SKILLS", "assess_action", "skills_for"]
+__all__ = ["ARM_SKILLS", "BODY_SKILLS", "assess_action", "excludes", "skills_for"]
 
 #: Skills of the base and the legs.
 BODY_SKILLS: Final[Mapping[str, Callable[[Body, Action], Skill]]] = {
@@ -50,7 +51,7 @@ ARM_SKILLS: Final[Mapping[str, Callable[[Body, Action, Luck], Skill]]] = {
 
 def skills_for(body: Body, step: PlanStep, known: frozenset[str], luck: Luck) -> list[tuple[Action, Skill]]:
     """The coroutines of a plan step, in its order; what is refused at once is a coroutine that fails at once."""
-    conflict = _conflict(step)
+    conflict = excludes(body, step, known)
     skills: list[tuple[Action, Skill]] = []
     for action in step.actions:
         if conflict:
@@ -69,6 +70,22 @@ def skills_for(body: Body, step: PlanStep, known: frozenset[str], luck: Luck) ->
 def _holds_furniture(body: Body) -> bool:
     """Whether a hand is at a door or drawer, which walking would tear at."""
     return any(name is not None and not body.thing(name).movable for name in body.held.values())
+
+
+def excludes(body: Body, step: PlanStep, known: frozenset[str]) -> bool:
+    """Whether two parallel actions exclude each other: both want one object, or one would walk off with the other."""
+    return _conflict(step) or (len(step.actions) == 2 and any(_walks(body, action, known) for action in step.actions))
+
+
+def _walks(body: Body, action: Action, known: frozenset[str]) -> bool:
+    """Whether an arm action would move the base to where the other arm does not expect it."""
+    if action.name != "Close" or action.object_id not in known:
+        return False
+    try:
+        plan = articulate.assess_open_close(body, action)
+    except SkillFailure:
+        return False
+    return isinstance(plan, Push) and plan.walks
 
 
 def _conflict(step: PlanStep) -> bool:

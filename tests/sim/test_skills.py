@@ -5,9 +5,12 @@ import pytest
 
 from data.records import Action, Arm, FailureCategory, PlanStep
 from sim.failures import FailureCode, SkillFailure
+from sim.navigation import Stance
 from sim.objects import ObjectPlacement
 from sim.session import FreePlay, Session
+from sim.skills.articulate import assess_open_close
 from sim.skills.body import Body
+from sim.skills.push import Push
 from sim.skills.remembered import remembered
 from sim.skills.runner import refuse, run_skills
 from sim.world import World
@@ -72,11 +75,105 @@ def test_a_drawer_opens_and_closes(session):
     assert session.world.objects["Drawer_1"].openness < 0.07
 
 
+def close_with_some_arm(session, door):
+    """Closes a door with the arm that can, as a planner would find out; returns what happened."""
+    outcomes = []
+    for arm in Arm:
+        outcomes += act(session, f"Close({arm}, {door})")
+        if outcomes[-1].success:
+            break
+    return outcomes[-1]
+
+
+def stands_as_before(session, before):
+    """Whether no movable object was moved by more than 3 cm and both arms are home."""
+    moved = [name for name, place in before.items() if np.linalg.norm(session.body.world_position(name)[:2] - place[:2]) > 0.03]
+    home = all(np.allclose(session.body.commanded_arm(arm), session.body.ready(arm), atol=1e-6) for arm in Arm)
+    return not moved and home
+
+
+def places(session, door):
+    others = (name for name, thing in session.world.objects.items() if thing.movable and name != door)
+    return {name: session.body.world_position(name) for name in others}
+
+
+@pytest.mark.parametrize("door", ["Microwave_1", "Cabinet_1", "Fridge_1"])
+def test_a_door_that_stands_open_is_pushed_shut(session, door):
+    start(session, FreePlay("kitchen_1", states={door: {"isOpen": True}}, placements=THINGS))
+    before = places(session, door)
+    assert act(session, f"GoTo({door})")[0].success
+    outcome = close_with_some_arm(session, door)
+    assert outcome.success, outcome
+    assert session.world.objects[door].openness < 0.12
+    assert session.body.held == dict.fromkeys(Arm) and stands_as_before(session, before)
+    assert act(session, f"Close(left, {door})")[0].code in ("AlreadyInState", "")
+
+
+def test_a_push_that_walks_has_no_company(session):
+    start(session, FreePlay("kitchen_1", states={"Cabinet_1": {"isOpen": True}}, placements=THINGS))
+    act(session, "GoTo(Cabinet_1)")
+    assert assess_open_close(session.body, Action.parse("Close(left, Cabinet_1)")).walks
+    codes = [outcome.code for outcome in act(session, "Close(left, Cabinet_1) & ResetArm(right)")]
+    assert codes == ["ArmConflict", "ArmConflict"]
+
+
+def test_what_a_robot_opens_it_closes_again(session):
+    start(session)
+    assert reach(session, "Open(left, Microwave_1)").success
+    assert session.world.objects["Microwave_1"].is_open
+    outcome = close_with_some_arm(session, "Microwave_1")
+    assert outcome.success, outcome
+    assert session.world.objects["Microwave_1"].openness < 0.12
+
+
+def test_a_door_far_away_is_not_walked_to(session):
+    start(session, FreePlay("kitchen_1", states={"Cabinet_1": {"isOpen": True}}))
+    session.teleport(1.0, 0.8, 0.0)
+    outcome = act(session, "Close(left, Cabinet_1)")[0]
+    assert outcome.code == "TooFar" and outcome.margins["reach_m"] > 0.0 and session.world.time_s == 0.0
+
+
+def test_a_push_is_planned_without_moving_anything_and_always_alike(session):
+    start(session, FreePlay("kitchen_1", states={"Cabinet_1": {"isOpen": True}}))
+    act(session, "GoTo(Cabinet_1)")
+    body, action = session.body, Action.parse("Close(left, Cabinet_1)")
+    before = (session.world.data.qpos.copy(), session.world.data.ctrl.copy(), body.planning_state())
+    plans = []
+    for _ in range(2):
+        body.plans.state = None
+        plans.append(assess_open_close(body, action))
+    assert all(isinstance(plan, Push) for plan in plans)
+    assert np.array_equal(plans[0].postures, plans[1].postures) and np.array_equal(plans[0].stances, plans[1].stances)
+    assert np.array_equal(session.world.data.qpos, before[0]) and np.array_equal(session.world.data.ctrl, before[1])
+    assert body.planning_state() == before[2]
+
+
+def test_a_stance_under_consideration_is_part_of_what_plans_depend_on(session):
+    start(session)
+    body = session.body
+    state, base = body.planning_state(), body.commanded_base()
+    with body.considering_stance(Stance(0.5, 0.5, 0.1)):
+        assert body.planning_state() != state and body.commanded_base() == Stance(0.5, 0.5, 0.1)
+    assert body.planning_state() == state and body.commanded_base() == base
+
+
 def test_a_switch_is_pressed(session):
     start(session)
     assert reach(session, "ToggleOn(left, StoveKnob_1)").success
     assert session.world.objects["StoveKnob_1"].is_toggled and session.world.objects["StoveBurner_1"].is_toggled
     assert act(session, "ToggleOn(left, StoveKnob_1)")[0].code == "AlreadyInState"
+
+
+@pytest.mark.parametrize(
+    ("room", "counter"), [("kitchen_2", ("CounterTop_1", (-0.6, 2.1))), ("bathroom_1", ("CounterTop_1", (0.2, 1.42)))]
+)
+def test_a_tap_beside_its_basin_fills_a_mug(session, room, counter):
+    start(session, FreePlay(room, placements=(ObjectPlacement("Mug_1", *counter),)))
+    assert reach(session, "ToggleOn(left, Faucet_1)").success and session.world.objects["Faucet_1"].is_toggled
+    arm = {"x1": "left", "h1": "right"}[session.robot.name]
+    assert reach(session, f"Pick({arm}, Mug_1)").success
+    assert reach(session, f"Fill({arm}, Faucet_1)").success
+    assert session.world.objects["Mug_1"].state.fillLitres > 0.1
 
 
 @pytest.mark.parametrize(

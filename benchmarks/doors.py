@@ -1,0 +1,100 @@
+"""Every hinged door of the ten rooms, opened and shut again by both robots: which arm succeeds, and how long it plans.
+
+    python benchmarks/doors.py [--robots h1 x1] [--rooms ROOM ...]
+
+Each door is shut twice by each arm: once after GoTo and the robot's own Open, once after GoTo when it stands wide open from the
+start. As a planner would, the robot changes its height when the failure says so and goes to another distance when it is too
+far. `shut` is the share of the door's range that is left (0: shut), `plan_s` the time of the last assessment.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+
+from data.records import Action, ActionOutcome, Arm, PlanStep
+from sim.failures import SkillFailure
+from sim.rooms import room_names
+from sim.session import FreePlay, Session
+
+#: What follows the object in GoTo, in turn: distances and bearings.
+PLACES = ("", ", 0.45", ", 0.55", ", auto, -20", ", auto, 20", ", 0.4", ", 0.5, -30", ", 0.5, 30", ", 0.6")
+
+
+def act(session: Session, text: str) -> ActionOutcome:
+    """One action of the language."""
+    return session.act(PlanStep.parse(text)).outcomes[0]
+
+
+def reach(session: Session, action: Action, places: tuple[str | None, ...]) -> tuple[str, float]:
+    """Does an action from the first place where it is possible; None stands for staying. Returns the code and planning time."""
+    refusal: SkillFailure | None = None
+    seconds = 0.0
+    for place in places:
+        if place is not None:
+            act(session, f"GoTo({action.object_id}{place})")
+        for _ in range(4):
+            started = time.perf_counter()
+            refusal = session.assess(action)
+            seconds = time.perf_counter() - started
+            if refusal is None:
+                outcome = session.act(PlanStep((action,))).outcomes[0]
+                return "ok" if outcome.success else str(outcome.code), seconds
+            change = refusal.margins.get("height_m")
+            if change is None:
+                break
+            act(session, f"{'MoveUp' if change > 0 else 'MoveDown'}({max(abs(change), 0.03):.2f})")
+    return str(refusal.code if refusal is not None else "none"), seconds
+
+
+def hinged(session: Session) -> list[str]:
+    """Objects of the running episode with a hinged door."""
+    return [name for name, thing in session.world.objects.items() if any(m.joint == "hinge" for m in thing.type.moving)]
+
+
+def try_door(session: Session, room: str, door: str) -> None:
+    """Prints one line per way of opening and arm."""
+    for way in ("opened by the robot", "open from the start"):
+        session.reset(FreePlay(room, states={door: {"isOpen": True}} if way == "open from the start" else {}), 0)
+        places: tuple[str | None, ...] = PLACES[:3]
+        if way == "opened by the robot":
+            codes = [reach(session, Action("Open", arm=arm, object_id=door), PLACES)[0] for arm in _until_open(session, door)]
+            if not session.world.objects[door].is_open:
+                print(f"{session.robot.name:5}{room:15}{door:13}{way:21}-     not opened: {codes[-1]}", flush=True)
+                continue
+            places = (None, *places)
+        start = session.snapshot()
+        for arm in Arm:
+            session.restore(start)
+            code, seconds = reach(session, Action("Close", arm=arm, object_id=door), places)
+            left = session.world.objects[door].openness
+            code = "ok" if code == "AlreadyInState" and left < 0.06 else code  # the body brushed it shut on the way
+            line = (
+                f"{session.robot.name:5}{room:15}{door:13}{way:21}{arm.value:6}{code:15}shut {left:.2f}  plan_s {seconds:.2f}"
+            )
+            print(line, flush=True)
+
+
+def _until_open(session: Session, door: str) -> Iterator[Arm]:
+    for arm in Arm:
+        if not session.world.objects[door].is_open:
+            yield arm
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--robots", nargs="+", default=["h1", "x1"])
+    parser.add_argument("--rooms", nargs="+", default=list(room_names()))
+    arguments = parser.parse_args()
+    for robot in arguments.robots:
+        session = Session(robot, image_size=0, all_known=True)
+        for room in arguments.rooms:
+            session.reset(FreePlay(room), 0)
+            for door in hinged(session):
+                try_door(session, room, door)
+        session.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,557 @@
+"""Shutting a hinged door from outside: the fist goes to the door's outside face near its free edge and follows the arc.
+
+Nothing ties the hand to the door: contact alone moves it. An open door's outside face looks away from where a robot stands to
+use what is inside, so the plan may begin with a short step to another stance, and the base may walk along while the hand
+pushes. Stances are screened with the reach maps, the survivors are solved and checked for collisions.
+
+Frames: world. The paper has no counterpart: Close is ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Action, Arm
+from sim.failures import FailureCode, SkillFailure
+from sim.navigation import Stance
+from sim.objects import MovingPart, ObjectInstance
+from sim.skills.body import ArmGoal, Body, wait
+from sim.skills.clearance import TOUCH_M, AtDoor
+from sim.skills.locomotion import step_to
+from sim.skills.manipulate import GRASP_GAP_M, stow
+from sim.skills.obstacles import navigation_map
+from sim.skills.reach import Reach, route
+from sim.skills.reach_map import HandPose
+from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.trajectory import min_jerk
+
+__all__ = ["Door", "Push", "plan_push", "push_shut"]
+
+Array = NDArray[np.float64]
+
+#: How far past shut the hand is led, share of the joint's range: the door is pressed against its stop.
+_PAST_SHUT: Final = 0.04
+#: Largest turn of the door between two waypoints.
+_STEP_RAD: Final = 0.16
+#: Where the fist may touch: shares of the way from hinge to free edge, and heights relative to the shoulder.
+_SPOTS: Final = ((0.88, -0.22), (0.72, -0.22), (0.88, -0.4), (0.88, -0.05), (0.58, -0.22), (0.72, -0.4))
+#: Half the width of a fist, with some room.
+_FIST_HALF_M: Final = 0.075
+#: Depth to which the fist is commanded into the door that it moves, and how exactly.
+_PRESS_M: Final = 0.006
+_PRESS_SLACK_M: Final = 0.006
+#: Distance of the grasp site from the face while it pushes, before the hand's real shape is known, and where it starts from.
+_FIST_M: Final = 0.05
+_BEFORE_M: Final = 0.1
+#: Longest way to the stance from which the door is pushed, and longest way along with the door.
+_STEP_M: Final = 1.3
+_ALONG_M: Final = 0.7
+_ALONG_RAD: Final = 1.2
+#: Half size and spacing of the grid of stances around the hinge.
+_GRID_M: Final = 1.3
+_SPACING_M: Final = 0.1
+#: Bearings (rad) of the point of contact from the robot's heading.
+_BEARINGS: Final = (0.0, 0.45, -0.45, 0.9, -0.9)
+#: Comfortable distances between shoulder and hand, as shares of the reach.
+_NEAR, _FAR = 0.45, 0.85
+#: Pairs of stances that get this far in the search, by stage.
+_KEPT: Final = 80
+_QUERIED: Final = 60
+_SOLVED: Final = 3
+#: Upper limit of solved stances in one plan, and in one that is made for another pelvis height to explain a failure.
+_TRIALS: Final = 14
+_TRIALS_EXPLAINING: Final = 4
+#: Room between the hands and the door before anything moves.
+_HAND_ROOM_M: Final = 0.004
+#: The same for a hand behind the door: its fingers would hook the door as they close.
+_FINGERS_M: Final = 0.035
+#: Thickness of an upper arm or forearm around its bone.
+_BONE_M: Final = 0.035
+#: Length of a hand before its wrist, measured from the grasp site.
+_HAND_M: Final = 0.14
+#: Turn of the door from which on the fist has met it.
+_NUDGED_RAD: Final = 0.02
+#: Peak speed of the free edge, m/s.
+_EDGE_SPEED: Final = 0.4
+#: How much deeper than in its push a fist may come to a door while it is drawn back.
+_CATCH_M: Final = 0.004
+#: How far a posture may be from the one before.
+_JUMP_RAD: Final = 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class Door:
+    """The geometry of a hinged door.
+
+    Attributes:
+        part: its joint.
+        anchor: (3,) a point of the hinge.
+        axis: (3,) unit vector along it.
+        front: (3,) outward normal of the shut door.
+        side: (3,) direction of the shut door from the hinge to the free edge.
+        width_m: distance from the hinge to the free edge.
+        face_m: how far the outside face is in front of the hinge.
+        back_m: how far the inside face is in front of the hinge.
+        heights: (low, high) of the panel, world.
+        now: present joint position.
+    """
+
+    part: MovingPart
+    anchor: Array
+    axis: Array
+    front: Array
+    side: Array
+    width_m: float
+    face_m: float
+    back_m: float
+    heights: tuple[float, float]
+    now: float
+
+    @staticmethod
+    def of(body: Body, thing: ObjectInstance, part: MovingPart) -> Door:
+        """Reads a door off the model."""
+        model, data = body.world.model, body.world.data
+        panel = max(
+            (int(geom) for geom in np.flatnonzero(model.geom_bodyid == part.body_id)),
+            key=lambda geom: float(np.prod(model.geom_aabb[geom, 3:])),
+        )
+        center, half = model.geom_pos[panel], model.geom_aabb[panel, 3:]
+        sign = 1.0 if center[0] > 0.0 else -1.0
+        frame = data.xmat[thing.body_id].reshape(3, 3)
+        anchor = data.xanchor[part.joint_id].copy()
+        height = float(anchor[2] + center[2])
+        return Door(
+            part=part,
+            anchor=anchor,
+            axis=data.xaxis[part.joint_id].copy(),
+            front=-frame[:, 1].copy(),
+            side=sign * frame[:, 0].copy(),
+            width_m=float(abs(center[0]) + half[0]),
+            face_m=float(half[1] - center[1]),
+            back_m=float(-half[1] - center[1]),
+            heights=(height - float(half[2]), height + float(half[2])),
+            now=float(data.qpos[part.qpos_adr]),
+        )
+
+    def _turned(self, direction: Array, position: float) -> Array:
+        c, s = np.cos(position), np.sin(position)
+        return c * direction + s * np.cross(self.axis, direction)
+
+    def normal(self, position: float) -> Array:
+        """(3,) outward normal of the door at a joint position."""
+        return self._turned(self.front, position)
+
+    def along(self, position: float) -> Array:
+        """(3,) direction from the hinge to the free edge at a joint position."""
+        return self._turned(self.side, position)
+
+    def point(self, position: float, along_m: float, height_m: float, out_m: float = 0.0) -> Array:
+        """(3,) point so far from the hinge, at a world height, and so far before the outside face."""
+        found = self.anchor + along_m * self.along(position) + (self.face_m + out_m) * self.normal(position)
+        return np.array([found[0], found[1], height_m])
+
+    def distance_m(self, points: Array, position: float) -> Array:
+        """(N,) horizontal distances between floor points (N, 2) and the door at a joint position."""
+        delta = points - self.anchor[:2]
+        u, v = delta @ self.along(position)[:2], delta @ self.normal(position)[:2]
+        outside_u = np.maximum(np.maximum(-u, u - self.width_m), 0.0)
+        outside_v = np.maximum(np.maximum(self.back_m - v, v - self.face_m), 0.0)
+        return np.hypot(outside_u, outside_v)
+
+    def before(self, state: AtDoor, position: float) -> bool:
+        """Whether the whole hand is on the outer side of the door."""
+        return float(np.min((state.hand - self.anchor) @ self.normal(position))) >= self.face_m
+
+    def outside(self, state: AtDoor, position: float) -> bool:
+        """Whether the hand is before the door and neither forearm nor upper arm passes through it."""
+        if not self.before(state, position):
+            return False
+        shoulder, elbow, site = state.bones
+        forearm = float(np.linalg.norm(site - elbow))
+        wrist = elbow + (site - elbow) * max(forearm - _HAND_M, 0.0) / max(forearm, 1e-9)  # the hand itself touches the door
+        shares = np.linspace(0.0, 1.0, 15)[:, None]
+        line = np.concatenate([shoulder + shares * (elbow - shoulder), elbow + shares * (wrist - elbow)])
+        delta = line - self.anchor
+        u, v = delta @ self.along(position), delta @ self.normal(position)
+        inside = (u > -0.05) & (u < self.width_m + _BONE_M) & (v > self.back_m - _BONE_M) & (v < self.face_m + 0.4 * _BONE_M)
+        inside &= (line[:, 2] > self.heights[0] - _BONE_M) & (line[:, 2] < self.heights[1] + _BONE_M)
+        return not bool(np.any(inside))
+
+
+@dataclass(frozen=True, slots=True)
+class Push:
+    """How a door is pushed shut.
+
+    Attributes:
+        reach: the motion of the fist to the face, from the first stance.
+        part: the door.
+        positions: (N,) joint positions along the way.
+        postures: (N, A) arm joints that go with them.
+        stances: (N, 3) base poses (x, y, yaw) that go with them.
+        away: (2, A) postures with which the fist is drawn back from the shut door.
+        way: (M, 2) polyline to the first stance, None when the robot already stands there.
+    """
+
+    reach: Reach
+    part: MovingPart
+    positions: Array
+    postures: Array
+    stances: Array
+    away: Array
+    way: Array | None
+
+    @property
+    def walks(self) -> bool:
+        """Whether the base moves at all."""
+        return self.way is not None or bool(np.any(np.ptp(self.stances, axis=0) > 1e-6))
+
+
+def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> Push | None:
+    """How one arm shuts a door by pushing, with as little walking as possible; None when no way was found."""
+    if any(name is not None and not body.thing(name).movable for name in body.held.values()):
+        return None  # a hand at another door or drawer: walking would tear at it
+    door = Door.of(body, thing, part)
+    low, high = part.range
+    goal = low - _PAST_SHUT * (high - low)
+    count = 2 + int(np.ceil(abs(door.now - goal) / _STEP_RAD))
+    positions = np.linspace(door.now, goal, count)
+    shoulder_m = float(body.shoulder(arm)[2])
+    trials = _TRIALS if body.considered_height_m is None else _TRIALS_EXPLAINING
+    for spot in _spots(body, door, shoulder_m):
+        for stances in _stances(body, arm, door, spot, positions)[:_SOLVED]:
+            if trials == 0:
+                return None
+            trials -= 1
+            push = _solve(body, arm, door, spot, positions, stances)
+            if push is not None:
+                return push
+    return None
+
+
+def _spots(body: Body, door: Door, shoulder_m: float) -> list[tuple[float, float]]:
+    """Where the fist may touch, as distances from the hinge and heights: beside the handle first, which would catch it."""
+    model, data = body.world.model, body.world.data
+    low, high = door.heights
+    clear: list[tuple[float, float]] = []
+    at_handle: list[tuple[float, float]] = []
+    handle = data.site_xpos[door.part.handle_site] if door.part.handle_site >= 0 else None
+    geoms = np.flatnonzero((model.geom_bodyid == door.part.body_id) & (model.geom_contype > 0))
+    half_m = min((float(model.geom_aabb[geom, 5]) for geom in geoms), default=0.0)  # the handle is lower than the panel
+    for share, rise in _SPOTS:
+        spot = (share * door.width_m, float(np.clip(shoulder_m + rise, low + 0.06, high - 0.06)))
+        beside = handle is None or abs(float((handle - door.anchor) @ door.along(door.now)) - spot[0]) > _FIST_HALF_M
+        above = handle is None or abs(float(handle[2]) - spot[1]) > half_m + _FIST_HALF_M
+        rank = clear if beside or above else at_handle
+        if spot not in clear and spot not in at_handle:
+            rank.append(spot)
+    return clear + at_handle
+
+
+# ---- stances
+
+
+def _stances(body: Body, arm: Arm, door: Door, spot: tuple[float, float], positions: Array) -> list[Array]:
+    """Base poses (N, 3) along the way from which the arm may push at a spot (distance from the hinge, height), best first."""
+    base = body.commanded_base()
+    sites = np.stack([door.point(float(p), *spot, _FIST_M) for p in positions])
+    nav = body.navigation()
+    first = _grid(door, base, sites[0])
+    ways = nav.ways(base.position).costs_m(first[:, :2])
+    here = np.zeros(len(first), dtype=bool)
+    here[0] = True
+    ways = np.where(here, 0.0, ways)
+    keep = (here | (nav.clearance(first[:, :2]) >= 0.0)) & (ways <= _STEP_M)
+    first, ways = first[keep], ways[keep]
+    turn = np.abs(_wrapped(first[:, 2] - base.yaw_rad))
+    strain = _strain(body, arm, first, np.broadcast_to(sites[0], (len(first), 3)))
+    cost = ways + 0.15 * turn + strain
+    cost[_behind(body, arm, door, first, sites[0], float(positions[0]))] = np.inf
+    first, cost = _best(first, cost)
+    room = navigation_map(body.world, body.spec.footprint_radius_m, door.part.body_id)
+    last = _grid(door, base, sites[-1])
+    last = np.concatenate([first, last])
+    last = last[room.clearance(last[:, :2]) >= -0.02]
+    last, last_cost = _best(last, _strain(body, arm, last, np.broadcast_to(sites[-1], (len(last), 3))))
+    if not len(first) or not len(last):
+        return []
+    # pairs of a first and a last stance
+    a, b = np.repeat(first, len(last), axis=0), np.tile(last, (len(first), 1))
+    change = np.stack([b[:, 0] - a[:, 0], b[:, 1] - a[:, 1], _wrapped(b[:, 2] - a[:, 2])], axis=1)
+    shift = np.hypot(change[:, 0], change[:, 1])
+    total = np.repeat(cost, len(last)) + np.tile(last_cost, len(first)) + 0.6 * shift + 0.2 * np.abs(change[:, 2])
+    fits = (shift <= _ALONG_M) & (np.abs(change[:, 2]) <= _ALONG_RAD)
+    a, change, total = a[fits], change[fits], total[fits]
+    shares = np.linspace(0.0, 1.0, len(positions))
+    strained = np.zeros(len(a))
+    clear = np.full(len(a), np.inf)
+    for share, site, position in zip(shares, sites, positions, strict=True):
+        pose = a + share * change
+        strained = np.maximum(strained, _strain(body, arm, pose, np.broadcast_to(site, (len(a), 3))))
+        clear = np.minimum(clear, door.distance_m(pose[:, :2], float(position)) - body.spec.footprint_radius_m)
+    # a robot that stands closer to the door than its disc allows may not come closer
+    total = total + 3.0 * strained
+    total[clear < -0.03] = np.inf
+    order = np.argsort(total, kind="stable")
+    found: list[Array] = []
+    for index in order[:_QUERIED]:
+        if not np.isfinite(total[index]):
+            break
+        way = a[index] + shares[:, None] * change[index]
+        if np.any(room.clearance(way[:, :2]) < -0.02):
+            continue
+        if all(body.within(arm, s, body.pelvis_height_m, Stance(*map(float, p))) for s, p in zip(sites, way, strict=True)):
+            found.append(way)
+            if len(found) >= _SOLVED:
+                break
+    return found
+
+
+def _grid(door: Door, base: Stance, site: Array) -> Array:
+    """(M, 3) base poses around a door that face the point of contact, the present one first."""
+    steps = np.arange(-_GRID_M, _GRID_M + 1e-9, _SPACING_M)
+    u, v = (axis.ravel() for axis in np.meshgrid(steps, steps))
+    spots = door.anchor[:2] + u[:, None] * door.side[:2] + v[:, None] * door.front[:2]
+    spots = spots[np.hypot(*(spots - site[:2]).T) < 0.95]
+    bearing = np.arctan2(site[1] - spots[:, 1], site[0] - spots[:, 0])
+    poses = [np.column_stack([spots, _wrapped(bearing + off)]) for off in _BEARINGS]
+    return np.concatenate([np.array([[base.x, base.y, base.yaw_rad]]), *poses])
+
+
+def _strain(body: Body, arm: Arm, poses: Array, sites: Array) -> Array:
+    """(M,) metres by which a hand at (M, 3) sites is too close to the shoulder or too far from it, infinite out of reach."""
+    shoulder, reach = body.maps[arm.value].shoulder, body.maps[arm.value].reach_m
+    local = _shoulders(body, arm, poses)
+    delta = sites - local
+    distance = np.linalg.norm(delta, axis=1)
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    ahead = c * delta[:, 0] + s * delta[:, 1] + float(shoulder[0])
+    strain = np.maximum(np.maximum(_NEAR * reach - distance, distance - _FAR * reach), 0.0)
+    strain += np.maximum(0.1 - ahead, 0.0)
+    strain[(distance > 0.98 * reach) | (distance < 0.25 * reach) | (ahead < -0.02)] = np.inf
+    return strain
+
+
+def _shoulders(body: Body, arm: Arm, poses: Array) -> Array:
+    """(M, 3) shoulders of the robot at base poses (M, 3)."""
+    base = body.commanded_base()
+    delta = body.shoulder(arm) - (base.x, base.y, 0.0)
+    local = body.turn_to_pelvis(delta)
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x, y = c * local[0] - s * local[1], s * local[0] + c * local[1]
+    return np.stack([poses[:, 0] + x, poses[:, 1] + y, np.full(len(poses), local[2])], axis=1)
+
+
+def _behind(body: Body, arm: Arm, door: Door, poses: Array, site: Array, position: float) -> NDArray[np.bool_]:
+    """(M,) whether the straight line from shoulder to hand would pass through the door."""
+    shoulders = _shoulders(body, arm, poses) - door.anchor
+    out = shoulders @ door.normal(position) - door.face_m
+    along = shoulders @ door.along(position)
+    hand = float((site - door.anchor) @ door.along(position))
+    crossing = hand + (along - hand) * _FIST_M / np.maximum(_FIST_M - out, 1e-6)
+    return (out < 0.0) & (crossing < door.width_m + 0.02)
+
+
+def _best(poses: Array, cost: Array) -> tuple[Array, Array]:
+    order = np.argsort(cost, kind="stable")[:_KEPT]
+    order = order[np.isfinite(cost[order])]
+    return poses[order], cost[order]
+
+
+def _wrapped(angle: Array) -> Array:
+    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+# ---- postures
+
+
+def _solve(body: Body, arm: Arm, door: Door, spot: tuple[float, float], positions: Array, stances: Array) -> Push | None:
+    """The arm's postures along the way, None when it cannot follow or would collide."""
+    base = body.commanded_base()
+    with body.considering_stance(Stance(*map(float, stances[0]))):  # a hand that is at the door already would move it
+        states = [body.probe.against_door(a, body.commanded_arm(a), door.part, door.now, fist=False) for a in Arm]
+    if any(state.gap_m < (_HAND_ROOM_M if door.before(state, door.now) else _FINGERS_M) for state in states):
+        return None
+    for wish in _directions(body, arm, door, spot, float(positions[0]), Stance(*map(float, stances[0]))):
+        postures: list[Array] = []
+        out_m = _FIST_M
+        for position, pose in zip(map(float, positions), stances, strict=True):
+            stance = Stance(*map(float, pose))
+            start = postures[-1] if postures else None
+            found = _at_face(body, arm, door, spot, position, stance, out_m, wish if start is None else None, start)
+            if found is None:
+                break
+            q, out_m = found
+            if start is not None and float(np.max(np.abs(q - start))) > _JUMP_RAD:
+                break
+            postures.append(q)
+        if len(postures) < len(positions):
+            continue
+        away = _away(body, arm, door, positions, np.stack(postures), Stance(*map(float, stances[-1])))
+        if away is None:
+            continue
+        first = Stance(*map(float, stances[0]))
+        with body.considering_stance(first):
+            reach = _approach(body, arm, door, spot, float(positions[0]), postures[0])
+        if reach is None:
+            continue
+        moves = float(np.hypot(first.x - base.x, first.y - base.y)) + abs(
+            float(_wrapped(np.array(first.yaw_rad - base.yaw_rad)))
+        )
+        way = body.navigation().ways(base.position).to(first.position) if moves > 1e-3 else None
+        if moves > 1e-3 and way is None:
+            return None
+        return Push(reach, door.part, positions, np.stack(postures), stances, away, way)
+    return None
+
+
+def _directions(
+    body: Body, arm: Arm, door: Door, spot: tuple[float, float], position: float, stance: Stance
+) -> Iterator[Array | None]:
+    """Directions of the forearm that are tried at the first contact: none in particular, into the face, from the shoulder."""
+    yield None
+    inward = -door.normal(position)
+    sight = door.point(position, *spot, _FIST_M) - _shoulders(body, arm, np.array([[stance.x, stance.y, stance.yaw_rad]]))[0]
+    sight[2] = 0.0
+    sight /= max(float(np.linalg.norm(sight)), 1e-9)
+    yield sight
+    yield inward
+    middle = inward + sight
+    if float(np.linalg.norm(middle)) > 0.3:
+        yield middle / np.linalg.norm(middle)
+
+
+def _at_face(
+    body: Body,
+    arm: Arm,
+    door: Door,
+    spot: tuple[float, float],
+    position: float,
+    stance: Stance,
+    out_m: float,
+    pointing: Array | None,
+    start: Array | None,
+) -> tuple[Array, float] | None:
+    """An arm posture whose fist presses on the door, and how far the grasp site then is before the face."""
+    with body.considering_stance(stance):
+        for _ in range(4):
+            goal = body.solve(arm, HandPose(door.point(position, *spot, out_m), pointing), start)
+            if goal.error_m > 0.025:
+                return None
+            state = body.probe.against_door(arm, goal.q, door.part, position)
+            if state.depth_m > TOUCH_M:
+                return None
+            if abs(state.gap_m + _PRESS_M) <= _PRESS_SLACK_M:
+                return (goal.q, out_m) if door.outside(state, position) else None
+            out_m = float(np.clip(out_m - (state.gap_m + _PRESS_M), -0.02, 0.2))
+            start = goal.q
+    return None
+
+
+def _away(body: Body, arm: Arm, door: Door, positions: Array, postures: Array, stance: Stance) -> Array | None:
+    """The postures after the push: at the shut door and away from it; None when the fist would catch the handle on the way."""
+    shut = door.part.range[0]
+    order = np.argsort(positions, kind="stable")
+    at = np.array([np.interp(shut, positions[order], column[order]) for column in postures.T])
+    with body.considering_stance(stance):
+        goal = body.solve(arm, HandPose(body.hand_at(arm, at) + _BEFORE_M * door.normal(shut)), start=at)
+        if goal.error_m > 0.04:
+            return None
+        states = [body.probe.against_door(arm, at + s * (goal.q - at), door.part, shut) for s in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)]
+    caught = any(state.gap_m < min(states[0].gap_m, 0.0) - _CATCH_M for state in states)
+    return None if caught else np.stack([at, goal.q])
+
+
+def _approach(body: Body, arm: Arm, door: Door, spot: tuple[float, float], position: float, at: Array) -> Reach | None:
+    """The way of the fist to its first contact, from the stance under consideration."""
+    hand = body.hand_at(arm, at)
+    for out in (door.normal(position), 0.7 * door.normal(position) + 0.7 * door.along(position)):
+        before: ArmGoal | None = None
+        for distance in (_BEFORE_M, 0.6 * _BEFORE_M):
+            before = body.solve(arm, HandPose(hand + distance * out), start=at)
+            if before.error_m <= 0.024 and float(np.max(np.abs(before.q - at))) < 1.5:
+                break
+            before = None
+        if before is None:
+            continue
+        steps = [before.q + share * (at - before.q) for share in (0.0, 0.25, 0.5, 0.75)]
+        states = [body.probe.against_door(arm, q, door.part, position) for q in steps]
+        if any(s.gap_m < -_PRESS_M or s.depth_m > TOUCH_M or not door.outside(s, position) for s in states):
+            continue
+        way = _route(body, arm, door, spot, position, before.q)
+        if way is not None:
+            return Reach(way, before.q, at)
+    return None
+
+
+def _route(
+    body: Body, arm: Arm, door: Door, spot: tuple[float, float], position: float, goal: Array
+) -> tuple[Array, ...] | None:
+    """Postures to pass on the way to `goal`: the usual ones, or one beyond the door's free edge."""
+    start = body.commanded_arm(arm)
+    way = route(body, arm, start, goal, (), 0.0)
+    if way is not None:
+        return way
+    for beyond, out in ((0.12, 0.08), (0.12, -0.05), (0.2, 0.0)):
+        point = door.point(position, door.width_m + beyond, spot[1], out)
+        if not body.within(arm, point, body.pelvis_height_m):
+            continue
+        via = body.solve(arm, HandPose(point), start=goal)
+        if via.error_m > 0.03:
+            continue
+        first, second = route(body, arm, start, via.q, (), 0.0), route(body, arm, via.q, goal, (), 0.0)
+        if first is not None and second is not None:
+            return (*first, via.q, *second)
+    return None
+
+
+# ---- motion
+
+
+def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
+    """Steps to the stance, brings the fist to the face, pushes along the arc, draws the fist back and goes home.
+
+    Raises:
+        SkillFailure: GraspMissed when the fist does not come to the door, or a contingency.
+    """
+    arm, part = action.arm, push.part
+    assert arm is not None and action.object_id is not None
+    if push.way is not None:
+        yield from step_to(body, push.way, float(push.stances[0, 2]))
+    yield from body.move_hand(arm, 0.0, 0.2)
+    yield from body.move_arm(arm, [*push.reach.way, push.reach.before])
+    yield from body.move_arm(arm, [push.reach.at], speed=0.5)
+    yield from wait(0.1)
+    panel = np.flatnonzero(body.world.model.geom_bodyid == part.body_id)
+    gap = body.probe.limb_gap_m(arm, panel)
+    moved = abs(float(body.world.data.qpos[part.qpos_adr]) - float(push.positions[0]))
+    if gap > GRASP_GAP_M and moved < _NUDGED_RAD:
+        yield from _draw_back(body, arm, push.reach.before[None])
+        raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": gap})
+    if outcome != "success":
+        yield from wait(0.2)
+        yield from _draw_back(body, arm, push.reach.before[None])
+        code = FailureCode.LOCKED if outcome == "locked" else FailureCode.NOTHING_HAPPENED
+        raise SkillFailure(code, contingency=outcome)
+    shares = np.linspace(0.0, 1.0, len(push.positions))
+    stances = push.stances + (0.0, 0.0, body.commanded_base().yaw_rad - push.stances[0, 2])  # the same turn of the heading
+    turn = abs(float(push.positions[-1] - push.positions[0]))
+    steps = max(2, round(1.875 * max(0.5 * turn, 0.1) / _EDGE_SPEED / CONTROL_DT_S))
+    for k in range(1, steps + 1):
+        s = min_jerk(k / steps)
+        body.command_arm(arm, np.array([np.interp(s, shares, column) for column in push.postures.T]))
+        body.command_base(*(float(np.interp(s, shares, column)) for column in stances.T))
+        yield
+    yield from wait(0.2)
+    yield from _draw_back(body, arm, push.away)
+
+
+def _draw_back(body: Body, arm: Arm, away: Array) -> Skill:
+    """Takes the fist off the face, straight out, and brings the arm home with an open hand."""
+    yield from body.move_arm(arm, list(away))
+    yield from body.move_hand(arm, 1.0, 0.2)
+    yield from stow(body, arm)
