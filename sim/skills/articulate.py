@@ -265,12 +265,15 @@ def _lead(body: Body, arm: Arm, pull: Pull) -> Skill:
     duration = 1.875 * max(length, 0.1) / _SPEED
     shares = np.linspace(0.0, 1.0, len(pull.positions))
     steps = max(2, round(duration / CONTROL_DT_S))
+    travelled = np.array([min_jerk(k / steps) for k in range(steps + 1)])
+    spots = base.position - pull.back_m * travelled[:, None] * ahead
+    way = np.column_stack([spots, np.full(steps + 1, base.yaw_rad)])
+    legs = body.walking_legs(way) if pull.back_m > 0.0 else None
     for k in range(1, steps + 1):
-        s = min_jerk(k / steps)
-        body.command_arm(arm, np.array([np.interp(s, shares, column) for column in pull.postures.T]))
-        if pull.back_m > 0.0:
-            x, y = base.position - s * pull.back_m * ahead
-            body.command_base(float(x), float(y), base.yaw_rad)
+        body.command_arm(arm, np.array([np.interp(travelled[k], shares, column) for column in pull.postures.T]))
+        if legs is not None:
+            body.command_base(*map(float, way[k]))
+            body.command_legs(legs[k])
         yield
     yield from wait(0.1)
 

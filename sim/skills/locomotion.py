@@ -34,7 +34,7 @@ HEIGHT_ACCELERATION_M_S2: Final = 1.0
 #: How deep an arm may press into something before the base stops, and by how much (rad, or m times 0.2) fingers may be bent
 #: beyond their limits.
 _PRESSED_M: Final = 0.03
-_STRAIN: Final = 0.025
+_STRAIN: Final = 0.04
 _RETREAT_S: Final = 0.35
 
 #: Heading of a step relative to the robot's own, by action.

@@ -541,10 +541,13 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
     stances = push.stances + (0.0, 0.0, body.commanded_base().yaw_rad - push.stances[0, 2])  # the same turn of the heading
     turn = abs(float(push.positions[-1] - push.positions[0]))
     steps = max(2, round(1.875 * max(0.5 * turn, 0.1) / _EDGE_SPEED / CONTROL_DT_S))
+    ways = np.array([min_jerk(k / steps) for k in range(steps + 1)])
+    way = np.column_stack([np.interp(ways, shares, column) for column in stances.T])
+    legs = body.walking_legs(way)
     for k in range(1, steps + 1):
-        s = min_jerk(k / steps)
-        body.command_arm(arm, np.array([np.interp(s, shares, column) for column in push.postures.T]))
-        body.command_base(*(float(np.interp(s, shares, column)) for column in stances.T))
+        body.command_arm(arm, np.array([np.interp(ways[k], shares, column) for column in push.postures.T]))
+        body.command_base(*map(float, way[k]))
+        body.command_legs(legs[k])
         yield
     yield from wait(0.2)
     yield from _draw_back(body, arm, push.away)
