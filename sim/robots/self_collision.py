@@ -1,0 +1,249 @@
+"""A robot against itself: how far its arms are from its trunk and legs and from each other, and rows that keep them apart.
+
+Shapes are the capsules and boxes of the description (`RobotSpec.self_shapes`), or, where it names none, those of the MJCF's
+geoms. Pinocchio carries them and coal measures the distances: a few microseconds for all pairs of a robot. Counted are arm
+against trunk (everything that belongs to no arm: legs and head too) and arm against arm, without what touches in the postures
+of rest and carrying: an upper arm and its shoulder.
+
+`SelfLimit` adds one row of a velocity damper per close pair to Pink's quadratic program (a control barrier on the distance),
+    n^T (J_a(p_a) - J_b(p_b)) dq <= gain (d - d_min),
+with n from a to b and p the nearest points. Overlapping pairs have a negative bound, which drives them apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Final
+
+import coal
+import mujoco
+import numpy as np
+import pink
+import pinocchio as pin
+from numpy.typing import NDArray
+from pink.limits import Limit
+
+from sim.robots.spec import SIDES, BodyShape, RobotSpec
+
+if TYPE_CHECKING:
+    from sim.robots.kinematics import RobotModel
+
+__all__ = ["SELF_TOUCH_M", "OwnBody", "SelfLimit", "default_shapes"]
+
+Array = NDArray[np.float64]
+
+#: Penetration of the shapes that still counts as touching only; they are a little larger than the body.
+SELF_TOUCH_M: Final = 0.002
+#: Distance that the rows keep, distance from which a pair has a row, share of the way to it that one iteration may go.
+_KEEP_M: Final = 0.005
+_NEAR_M: Final = 0.1
+_GAIN: Final = 0.8
+#: What one iteration drives overlapping shapes apart at most: more would ask for what the joints cannot do in one step.
+_ESCAPE_M: Final = 0.03
+#: Distance reported for robots whose shapes make no pair.
+_FAR_M: Final = 1.0
+
+
+class OwnBody:
+    """The shapes of a robot on its kinematics.
+
+    Attributes:
+        geometry: Pinocchio's shapes on the whole robot's model, with all pairs that count.
+        sides: per shape `left` or `right` for an arm's, `""` for the trunk's.
+    """
+
+    def __init__(self, robot: RobotModel) -> None:
+        self._robot = robot
+        spec, model = robot.spec, robot.model
+        self.geometry = pin.GeometryModel()
+        self.sides: list[str] = []
+        tops = {side: model.getJointId(spec.arms[side].joints[0]) for side in SIDES}
+        for number, shape in enumerate(spec.self_shapes or default_shapes(spec)):
+            index = robot.frame_id(shape.body)
+            joint, body = model.frames[index].parentJoint, model.frames[index].placement
+            solid, at = _solid(shape)
+            self.geometry.addGeometryObject(pin.GeometryObject(f"{shape.body}_{number}", joint, index, body * at, solid))
+            above = set(model.supports[joint])
+            self.sides.append(next((side for side, top in tops.items() if top in above), ""))
+        for a, first in enumerate(self.sides):
+            for b, second in enumerate(self.sides):
+                if first and (not second or (first, second) == SIDES):
+                    self.geometry.addCollisionPair(pin.CollisionPair(a, b))
+        self._root = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        self._data = model.createData()
+        self._leave_out_neighbours()
+        self._kept: dict[tuple[str, ...], tuple[pin.GeometryModel, pin.GeometryData]] = {}
+
+    def _leave_out_neighbours(self) -> None:
+        for kind in ("rest", "carry"):
+            data = self.geometry.createData()
+            self._place(self._robot.arm_posture(self._robot.posture(), kind))
+            pin.updateGeometryPlacements(self._robot.model, self._data, self.geometry, data)
+            pin.computeDistances(self.geometry, data)
+            near = [result.min_distance < _KEEP_M for result in data.distanceResults]
+            for pair, touches in zip(_pairs(self.geometry), near, strict=True):
+                if touches:
+                    self.geometry.removeCollisionPair(pin.CollisionPair(*pair))
+
+    def _place(self, q: Array) -> None:
+        pin.forwardKinematics(self._robot.model, self._data, self._robot.configuration(self._root, q))
+
+    def leave_pairs(self, geometry: pin.GeometryModel, arms: Iterable[str], *, trunk_only: bool = False) -> None:
+        """Takes the pairs out of `geometry`, whose shapes are in this body's order, that have no shape of `arms`.
+
+        Args:
+            geometry: of the whole or of a reduced model.
+            arms: `left`, `right` or both.
+            trunk_only: whether pairs of arm and arm go too.
+        """
+        wanted = set(arms)
+        for a, b in _pairs(geometry):
+            if not wanted & {self.sides[a], self.sides[b]} or (trunk_only and self.sides[b]):
+                geometry.removeCollisionPair(pin.CollisionPair(a, b))
+
+    def clearance_m(self, q: Array, arms: Sequence[str] = SIDES, *, trunk_only: bool = False) -> float:
+        """Smallest distance of the given arms to the trunk and, unless `trunk_only`, to the other arm; negative inside.
+
+        Args:
+            q: (J,) joints.
+            arms: `left`, `right` or both.
+            trunk_only: whether the other arm is left out.
+        """
+        key = (*sorted(arms), *(("trunk",) if trunk_only else ()))
+        if key not in self._kept:
+            kept = self.geometry.clone()
+            self.leave_pairs(kept, arms, trunk_only=trunk_only)
+            self._kept[key] = (kept, kept.createData())
+        geometry, data = self._kept[key]
+        if not len(geometry.collisionPairs):
+            return _FAR_M
+        self._place(np.asarray(q, dtype=float))
+        pin.updateGeometryPlacements(self._robot.model, self._data, geometry, data)
+        return float(data.distanceResults[pin.computeDistances(geometry, data)].min_distance)
+
+    def pose_others(self, geometry: pin.GeometryModel, root: Array, q: Array, arms: Sequence[str]) -> None:
+        """Puts the shapes of other arms, fixed in a reduced model's `geometry`, where the joints `q` (J,) have them.
+
+        Args:
+            geometry: of a model reduced to the joints of `arms`, shapes in the order of this body's.
+            root: (7,) pose of the pelvis in the frame of that model.
+            q: (J,) joints.
+            arms: those that the reduced model moves.
+        """
+        pin.forwardKinematics(self._robot.model, self._data, self._robot.configuration(root, q))
+        for number, side in enumerate(self.sides):
+            if side and side not in arms:
+                shape = self.geometry.geometryObjects[number]
+                geometry.geometryObjects[number].placement = self._data.oMi[shape.parentJoint] * shape.placement
+
+
+class SelfLimit(Limit):
+    """Rows that keep the close pairs of a model apart. Distances are computed once per configuration."""
+
+    def __init__(self, model: pin.Model, data: pin.Data, geometry: pin.GeometryModel) -> None:
+        self._model, self._data = model, data
+        self.geometry = geometry
+        self._measured = geometry.createData()
+        self._pairs = [
+            (geometry.geometryObjects[a].parentJoint, geometry.geometryObjects[b].parentJoint) for a, b in _pairs(geometry)
+        ]
+        self._at: Array | None = None
+        self._clearance_m = _FAR_M
+
+    def forget(self) -> None:
+        """The next question measures again, because shapes were moved."""
+        self._at = None
+
+    def clearance_m(self, configuration: pink.Configuration) -> float:
+        """Smallest distance of all pairs, negative inside. A configuration that moves on has another array of positions."""
+        if self._at is not configuration.q and self._pairs:
+            self._at = configuration.q
+            pin.updateGeometryPlacements(self._model, self._data, self.geometry, self._measured)
+            nearest = pin.computeDistances(self.geometry, self._measured)
+            self._clearance_m = float(self._measured.distanceResults[nearest].min_distance)
+        return self._clearance_m
+
+    def compute_qp_inequalities(self, configuration: pink.Configuration, dt: float) -> tuple[Array, Array] | None:
+        """See `pink.limits.Limit`."""
+        if self.clearance_m(configuration) > _NEAR_M:
+            return None
+        rows, bounds = [], []
+        for (a, b), result in zip(self._pairs, self._measured.distanceResults, strict=True):
+            distance = result.min_distance
+            if distance > _NEAR_M:
+                continue
+            normal = np.asarray(result.normal)
+            row = self._along(a, result.getNearestPoint1(), normal)
+            rows.append(row if b == 0 else row - self._along(b, result.getNearestPoint2(), normal))
+            bounds.append(max(_GAIN * (distance - _KEEP_M), -_ESCAPE_M))
+        return np.stack(rows), np.array(bounds)
+
+    def _along(self, joint: int, point: Array, direction: Array) -> Array:
+        """(N,) how fast a point of a joint's body moves along a direction, per joint velocity."""
+        jacobian = pin.getJointJacobian(self._model, self._data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        arm = np.asarray(point) - self._data.oMi[joint].translation
+        return direction @ jacobian[:3] + (pin.skew(arm) @ direction) @ jacobian[3:]
+
+
+def _pairs(geometry: pin.GeometryModel) -> list[tuple[int, int]]:
+    """Copies of the pairs' shape numbers: Pinocchio's own pairs move when one is taken out."""
+    return [(pair.first, pair.second) for pair in geometry.collisionPairs]
+
+
+def _solid(shape: BodyShape) -> tuple[coal.CollisionGeometry, pin.SE3]:
+    """A shape and where it is in its body's frame."""
+    start = np.asarray(shape.start, dtype=float)
+    if shape.half_m is not None:
+        return coal.Box(*(2.0 * half for half in shape.half_m)), pin.SE3(np.eye(3), start)
+    way = np.asarray(shape.end, dtype=float) - start
+    length = float(np.linalg.norm(way))
+    turn = np.eye(3) if length < 1e-9 else pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), way).matrix()
+    return coal.Capsule(shape.radius_m, length), pin.SE3(turn, start + 0.5 * way)
+
+
+def default_shapes(spec: RobotSpec) -> tuple[BodyShape, ...]:
+    """Shapes of a robot that declares none: per body one capsule around its geoms, one for each whole hand.
+
+    A body's primitive geoms go before its meshes. The capsule has the direction in which the geoms' corners spread most.
+    """
+    model = mujoco.MjModel.from_xml_path(str(spec.mjcf_path))
+    data = mujoco.MjData(model)
+    for arm in spec.arms.values():
+        for name, value in zip(arm.hand_joints, arm.hand_open, strict=True):
+            data.qpos[model.joint(name).qposadr[0]] = value
+    mujoco.mj_kinematics(model, data)
+    wrists = {int(model.joint(arm.joints[-1]).bodyid[0]) for arm in spec.arms.values()}
+    owner = np.arange(model.nbody)
+    for body in range(1, model.nbody):  # what hangs on a wrist belongs to it
+        parent = int(owner[model.body_parentid[body]])
+        owner[body] = parent if parent in wrists else body
+    shapes = []
+    for body in range(1, model.nbody):
+        geoms = np.flatnonzero(owner[model.geom_bodyid] == body)
+        solid = geoms[model.geom_type[geoms] != int(mujoco.mjtGeom.mjGEOM_MESH)]
+        geoms = solid if len(solid) else geoms
+        if not len(geoms):
+            continue
+        rotation, origin = data.xmat[body].reshape(3, 3), data.xpos[body]
+        points = np.concatenate([_corners(model, data, int(geom)) for geom in geoms])
+        shapes.append(_capsule_around(model.body(body).name, (points - origin) @ rotation))
+    return tuple(shapes)
+
+
+def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Array:
+    """(8, 3) corners of a geom's box in the world."""
+    signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
+    local = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
+    return data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T
+
+
+def _capsule_around(body: str, points: Array) -> BodyShape:
+    """A capsule about the middle of points (N, 3), as wide as their root mean square distance across and as long as they are."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    away = points - middle
+    axis = np.linalg.svd(away, full_matrices=False)[2][0]
+    along = away @ axis
+    radius = float(np.sqrt(np.mean(np.sum(away**2, axis=1) - along**2)))
+    half = max(float(np.abs(along).max()) - radius, 0.0)
+    ends = [tuple(float(v) for v in middle + sign * half * axis) for sign in (-1.0, 1.0)]
+    return BodyShape(body, (ends[0][0], ends[0][1], ends[0][2]), (ends[1][0], ends[1][1], ends[1][2]), radius)
