@@ -18,6 +18,7 @@ import daqp
 import numpy as np
 import pink
 import pinocchio as pin
+import qpsolvers
 from numpy.typing import NDArray
 from pink.limits import ConfigurationLimit, Limit, VelocityLimit
 from pink.tasks import ComTask, FrameTask, PostureTask, Task
@@ -47,27 +48,26 @@ _BANK_SIZE = 160
 _CACHED = 256
 #: What the solver takes for minus infinity.
 _UNBOUNDED = -1e30
+_NO_ROWS = np.zeros((0, 64))
+_NO_BOUNDS = np.zeros(0)
 
 
-class _JointLimits(Limit):
-    """Pink's limits of joint positions and velocities, with the part that does not depend on the configuration kept."""
+class _JointLimits:
+    """Pink's limits of joint positions and velocities, as one interval per joint: the solver takes those as such."""
 
     def __init__(self, model: pin.Model) -> None:
         position, velocity = ConfigurationLimit(model), VelocityLimit(model)
-        self._model = model
-        self._columns = position.indices
-        self._gain = position.config_limit_gain
-        if position.projection_matrix is None or velocity.projection_matrix is None:
+        if len(position.indices) != model.nv or len(velocity.indices) != model.nv:
             raise ValueError("a robot whose movable joints have no limits cannot be solved for")
-        rows = (position.projection_matrix, velocity.projection_matrix)
-        self._matrix: Array = np.vstack([sign * part for part in rows for sign in (1.0, -1.0)])
-        self._step: Array = np.tile(velocity.velocity_limit[velocity.indices], 2)
+        self._model = model
+        self._gain = position.config_limit_gain
+        self._step: Array = _DT_S * velocity.velocity_limit
 
-    def compute_qp_inequalities(self, configuration: pink.Configuration, dt: float) -> tuple[Array, Array]:
-        """See `pink.limits.Limit`."""
-        up = pin.difference(self._model, configuration.q, self._model.upperPositionLimit)[self._columns]
-        down = pin.difference(self._model, configuration.q, self._model.lowerPositionLimit)[self._columns]
-        return self._matrix, np.concatenate([self._gain * up, -(self._gain * down), dt * self._step])
+    def interval(self, q: Array) -> tuple[Array, Array]:
+        """(N,) least and largest change of each joint in one iteration from the positions `q`."""
+        down = self._gain * pin.difference(self._model, q, self._model.lowerPositionLimit)
+        up = self._gain * pin.difference(self._model, q, self._model.upperPositionLimit)
+        return np.maximum(down, -self._step), np.minimum(up, self._step)
 
 
 class _HandTask(FrameTask):
@@ -349,14 +349,15 @@ class PinkCore:
             com = ComTask(cost=0.05)
             com.set_target_from_configuration(configuration)
             tasks.append(com)
-        limits: list[Limit] = [reduced.limits, reduced.own] if self._avoid_self else [reduced.limits]
+        limits: list[Limit] = [reduced.own] if self._avoid_self else []
         previous, error = np.inf, np.inf
         before, clearance = -np.inf, -np.inf
         step = 0
         while step < _MAX_ITERATIONS:
             step += 1
             problem = pink.build_ik(configuration, tasks, _DT_S, damping=1e-8, limits=limits)
-            velocity = _solved(*(np.asarray(part) for part in (problem.P, problem.q, problem.G, problem.h))) / _DT_S
+            low, high = reduced.limits.interval(configuration.q)
+            velocity = _solved(problem, low, high) / _DT_S
             configuration.integrate_inplace(velocity, _DT_S)
             error = max(float(np.linalg.norm(task.compute_error(configuration)[:3])) for task, _ in hands)
             if error < 0.1 * tolerance_m or abs(previous - error) < max(_STALL_M, _STALL_FRACTION * error):
@@ -375,16 +376,20 @@ class PinkCore:
         return _Found(error, angle, clearance, np.asarray(configuration.q)[order].copy()), step
 
 
-def _solved(hessian: Array, gradient: Array, rows: Array, bounds: Array) -> Array:
-    """(N,) minimum of a convex quadratic program with rows @ x <= bounds.
+def _solved(problem: qpsolvers.Problem, low: Array, high: Array) -> Array:
+    """(N,) minimum of Pink's quadratic program between `low` and `high` (N,).
 
-    Bounds below zero, which drive overlapping shapes apart, are given up where they contradict the others.
+    Bounds of rows below zero, which drive overlapping shapes apart, are given up where they contradict the others.
     The solver is asked directly: the checks and copies around it in `pink.solve_ik` took as long as the solution.
     """
-    free, kind = np.full(len(bounds), _UNBOUNDED), np.zeros(len(bounds), dtype=c_int)
-    x, _, flag, _ = daqp.solve(hessian, gradient, rows, bounds, free, kind)
+    rows = _NO_ROWS[:, : len(low)] if problem.G is None else np.asarray(problem.G)
+    bounds = _NO_BOUNDS if problem.h is None else np.asarray(problem.h)
+    below, kind = np.full(len(bounds), _UNBOUNDED), np.zeros(len(low) + len(bounds), dtype=c_int)
+    lower = np.concatenate([low, below])
+    x, _, flag, _ = daqp.solve(problem.P, problem.q, rows, np.concatenate([high, bounds]), lower, kind)
     if flag <= 0:
-        x, _, flag, _ = daqp.solve(hessian, gradient, rows, np.maximum(bounds, 0.0), free, kind)
+        upper = np.concatenate([high, np.maximum(bounds, 0.0)])
+        x, _, flag, _ = daqp.solve(problem.P, problem.q, rows, upper, lower, kind)
     if flag <= 0:
         raise ArithmeticError(f"inverse kinematics: the quadratic program has no solution (exit flag {flag})")
     return x

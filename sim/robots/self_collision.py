@@ -2,7 +2,7 @@
 
 Shapes are the capsules and boxes of the description (`RobotSpec.self_shapes`), or, where it names none, those of the MJCF's
 geoms. Pinocchio carries them and coal measures the distances: a few microseconds for all pairs of a robot. Counted are arm
-against trunk (everything that belongs to no arm: legs and head too) and arm against arm, without what touches in the postures
+against trunk (head and pelvis too), arm against legs and arm against arm, without what touches in the postures
 of rest and carrying: an upper arm and its shoulder.
 
 `SelfLimit` adds one row of a velocity damper per close pair to Pink's quadratic program (a control barrier on the distance),
@@ -40,6 +40,8 @@ _NEAR_M: Final = 0.1
 _GAIN: Final = 0.8
 #: What one iteration drives overlapping shapes apart at most: more would ask for what the joints cannot do in one step.
 _ESCAPE_M: Final = 0.03
+#: Parts that a shape may belong to.
+_PARTS: Final = (*SIDES, "trunk", "legs")
 #: Distance reported for robots whose shapes make no pair.
 _FAR_M: Final = 1.0
 
@@ -49,30 +51,31 @@ class OwnBody:
 
     Attributes:
         geometry: Pinocchio's shapes on the whole robot's model, with all pairs that count.
-        sides: per shape `left` or `right` for an arm's, `""` for the trunk's.
+        parts: per shape what it belongs to: `left` or `right` (arm), `legs`, or `trunk`, which is all the rest.
     """
 
     def __init__(self, robot: RobotModel) -> None:
         self._robot = robot
         spec, model = robot.spec, robot.model
         self.geometry = pin.GeometryModel()
-        self.sides: list[str] = []
-        tops = {side: model.getJointId(spec.arms[side].joints[0]) for side in SIDES}
+        self.parts: list[str] = []
+        arms = {side: {model.getJointId(name) for name in spec.arms[side].joints} for side in SIDES}
+        members = {**arms, "legs": {model.getJointId(name) for name in spec.leg_joints}}
         for number, shape in enumerate(spec.self_shapes or default_shapes(spec)):
             index = robot.frame_id(shape.body)
             joint, body = model.frames[index].parentJoint, model.frames[index].placement
             solid, at = _solid(shape)
             self.geometry.addGeometryObject(pin.GeometryObject(f"{shape.body}_{number}", joint, index, body * at, solid))
             above = set(model.supports[joint])
-            self.sides.append(next((side for side, top in tops.items() if top in above), ""))
-        for a, first in enumerate(self.sides):
-            for b, second in enumerate(self.sides):
-                if first and (not second or (first, second) == SIDES):
+            self.parts.append(next((part for part, joints in members.items() if joints & above), "trunk"))
+        for a, first in enumerate(self.parts):
+            for b, second in enumerate(self.parts):
+                if first in SIDES and (second not in SIDES or (first, second) == SIDES):
                     self.geometry.addCollisionPair(pin.CollisionPair(a, b))
         self._root = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
         self._data = model.createData()
         self._leave_out_neighbours()
-        self._kept: dict[tuple[str, ...], tuple[pin.GeometryModel, pin.GeometryData]] = {}
+        self._kept: dict[tuple[str, str], tuple[pin.GeometryModel, pin.GeometryData]] = {}
 
     def _leave_out_neighbours(self) -> None:
         for kind in ("rest", "carry"):
@@ -88,38 +91,43 @@ class OwnBody:
     def _place(self, q: Array) -> None:
         pin.forwardKinematics(self._robot.model, self._data, self._robot.configuration(self._root, q))
 
-    def leave_pairs(self, geometry: pin.GeometryModel, arms: Iterable[str], *, trunk_only: bool = False) -> None:
-        """Takes the pairs out of `geometry`, whose shapes are in this body's order, that have no shape of `arms`.
+    def leave_pairs(self, geometry: pin.GeometryModel, arms: Iterable[str], against: Iterable[str] = _PARTS) -> None:
+        """Takes the pairs out of `geometry`, whose shapes are in this body's order, that are not of `arms` against something.
 
         Args:
             geometry: of the whole or of a reduced model.
             arms: `left`, `right` or both.
-            trunk_only: whether pairs of arm and arm go too.
+            against: parts of the robot.
         """
-        wanted = set(arms)
+        ours, theirs = set(arms), set(against)
         for a, b in _pairs(geometry):
-            if not wanted & {self.sides[a], self.sides[b]} or (trunk_only and self.sides[b]):
+            first, second = self.parts[a], self.parts[b]
+            if not ((first in ours and second in theirs) or (second in ours and first in theirs)):
                 geometry.removeCollisionPair(pin.CollisionPair(a, b))
 
-    def clearance_m(self, q: Array, arms: Sequence[str] = SIDES, *, trunk_only: bool = False) -> float:
-        """Smallest distance of the given arms to the trunk and, unless `trunk_only`, to the other arm; negative inside.
+    def clearance_m(self, q: Array, arms: Sequence[str] = SIDES, against: Sequence[str] = _PARTS) -> float:
+        """Smallest distance of the given arms to parts of the robot, the other arm among them; negative inside.
 
         Args:
             q: (J,) joints.
             arms: `left`, `right` or both.
-            trunk_only: whether the other arm is left out.
+            against: parts of the robot, see `parts`.
         """
-        key = (*sorted(arms), *(("trunk",) if trunk_only else ()))
+        self._place(np.asarray(q, dtype=float))
+        return self.clearance_at_m(self._data, arms, against)
+
+    def clearance_at_m(self, data: pin.Data, arms: Sequence[str] = SIDES, against: Sequence[str] = _PARTS) -> float:
+        """See `clearance_m`; for data of the whole robot's model whose forward kinematics are done."""
+        key = (" ".join(arms), " ".join(against))
         if key not in self._kept:
             kept = self.geometry.clone()
-            self.leave_pairs(kept, arms, trunk_only=trunk_only)
+            self.leave_pairs(kept, arms, against)
             self._kept[key] = (kept, kept.createData())
-        geometry, data = self._kept[key]
+        geometry, measured = self._kept[key]
         if not len(geometry.collisionPairs):
             return _FAR_M
-        self._place(np.asarray(q, dtype=float))
-        pin.updateGeometryPlacements(self._robot.model, self._data, geometry, data)
-        return float(data.distanceResults[pin.computeDistances(geometry, data)].min_distance)
+        pin.updateGeometryPlacements(self._robot.model, data, geometry, measured)
+        return float(measured.distanceResults[pin.computeDistances(geometry, measured)].min_distance)
 
     def pose_others(self, geometry: pin.GeometryModel, root: Array, q: Array, arms: Sequence[str]) -> None:
         """Puts the shapes of other arms, fixed in a reduced model's `geometry`, where the joints `q` (J,) have them.
@@ -131,8 +139,8 @@ class OwnBody:
             arms: those that the reduced model moves.
         """
         pin.forwardKinematics(self._robot.model, self._data, self._robot.configuration(root, q))
-        for number, side in enumerate(self.sides):
-            if side and side not in arms:
+        for number, part in enumerate(self.parts):
+            if part in SIDES and part not in arms:
                 shape = self.geometry.geometryObjects[number]
                 geometry.geometryObjects[number].placement = self._data.oMi[shape.parentJoint] * shape.placement
 
@@ -144,9 +152,12 @@ class SelfLimit(Limit):
         self._model, self._data = model, data
         self.geometry = geometry
         self._measured = geometry.createData()
-        self._pairs = [
-            (geometry.geometryObjects[a].parentJoint, geometry.geometryObjects[b].parentJoint) for a, b in _pairs(geometry)
-        ]
+        pairs = _pairs(geometry)
+        #: the very results that a measurement fills in
+        self._results = [self._measured.distanceResults[index] for index in range(len(pairs))]
+        joints = [shape.parentJoint for shape in geometry.geometryObjects]
+        # (P, N) 1 where a joint moves a pair's first shape only, -1 where the second only
+        self._moves: Array = np.array([_supports(model, joints[a]) - _supports(model, joints[b]) for a, b in pairs])
         self._at: Array | None = None
         self._clearance_m = _FAR_M
 
@@ -156,33 +167,38 @@ class SelfLimit(Limit):
 
     def clearance_m(self, configuration: pink.Configuration) -> float:
         """Smallest distance of all pairs, negative inside. A configuration that moves on has another array of positions."""
-        if self._at is not configuration.q and self._pairs:
+        if self._at is not configuration.q and self._results:
             self._at = configuration.q
             pin.updateGeometryPlacements(self._model, self._data, self.geometry, self._measured)
-            nearest = pin.computeDistances(self.geometry, self._measured)
-            self._clearance_m = float(self._measured.distanceResults[nearest].min_distance)
+            self._clearance_m = float(self._results[pin.computeDistances(self.geometry, self._measured)].min_distance)
         return self._clearance_m
 
     def compute_qp_inequalities(self, configuration: pink.Configuration, dt: float) -> tuple[Array, Array] | None:
-        """See `pink.limits.Limit`."""
+        """See `pink.limits.Limit`.
+
+        Both nearest points lie on one line along the normal, so that one wrench on it tells how fast either moves.
+        """
         if self.clearance_m(configuration) > _NEAR_M:
             return None
-        rows, bounds = [], []
-        for (a, b), result in zip(self._pairs, self._measured.distanceResults, strict=True):
+        close, lines, bounds = [], [], []
+        for index, result in enumerate(self._results):  # numbers one by one: arrays of three cost more than what they save
             distance = result.min_distance
-            if distance > _NEAR_M:
-                continue
-            normal = np.asarray(result.normal)
-            row = self._along(a, result.getNearestPoint1(), normal)
-            rows.append(row if b == 0 else row - self._along(b, result.getNearestPoint2(), normal))
-            bounds.append(max(_GAIN * (distance - _KEEP_M), -_ESCAPE_M))
-        return np.stack(rows), np.array(bounds)
+            if distance < _NEAR_M:
+                (x, y, z), (u, v, w) = result.getNearestPoint1().tolist(), result.normal.tolist()
+                close.append(index)
+                lines.append((u, v, w, y * w - z * v, z * u - x * w, x * v - y * u))
+                bounds.append(max(_GAIN * (distance - _KEEP_M), -_ESCAPE_M))
+        return (np.array(lines) @ self._data.J) * self._moves[close], np.array(bounds)
 
-    def _along(self, joint: int, point: Array, direction: Array) -> Array:
-        """(N,) how fast a point of a joint's body moves along a direction, per joint velocity."""
-        jacobian = pin.getJointJacobian(self._model, self._data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-        arm = np.asarray(point) - self._data.oMi[joint].translation
-        return direction @ jacobian[:3] + (pin.skew(arm) @ direction) @ jacobian[3:]
+
+def _supports(model: pin.Model, joint: int) -> Array:
+    """(N,) 1 for the velocities that move a joint's body."""
+    out = np.zeros(model.nv)
+    for above in model.supports[joint]:
+        if above:
+            start = model.joints[above].idx_v
+            out[start : start + model.joints[above].nv] = 1.0
+    return out
 
 
 def _pairs(geometry: pin.GeometryModel) -> list[tuple[int, int]]:
