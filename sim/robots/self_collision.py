@@ -33,9 +33,11 @@ __all__ = ["SELF_TOUCH_M", "OwnBody", "SelfLimit", "default_shapes"]
 Array = NDArray[np.float64]
 
 #: Penetration of the shapes that still counts as touching only; they are a little larger than the body.
-SELF_TOUCH_M: Final = 0.002
+SELF_TOUCH_M: Final = 0.005
+#: Shapes nearer than this in the postures of rest and carrying are neighbours.
+_NEIGHBOUR_M: Final = 0.005
 #: Distance that the rows keep, distance from which a pair has a row, share of the way to it that one iteration may go.
-_KEEP_M: Final = 0.005
+_KEEP_M: Final = 0.0
 _NEAR_M: Final = 0.1
 _GAIN: Final = 0.8
 #: What one iteration drives overlapping shapes apart at most: more would ask for what the joints cannot do in one step.
@@ -83,7 +85,7 @@ class OwnBody:
             self._place(self._robot.arm_posture(self._robot.posture(), kind))
             pin.updateGeometryPlacements(self._robot.model, self._data, self.geometry, data)
             pin.computeDistances(self.geometry, data)
-            near = [result.min_distance < _KEEP_M for result in data.distanceResults]
+            near = [result.min_distance < _NEIGHBOUR_M for result in data.distanceResults]
             for pair, touches in zip(_pairs(self.geometry), near, strict=True):
                 if touches:
                     self.geometry.removeCollisionPair(pin.CollisionPair(*pair))
