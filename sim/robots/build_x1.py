@@ -31,7 +31,7 @@ WHITE = (0.86, 0.87, 0.9, 1.0)
 GREY = (0.35, 0.37, 0.42, 1.0)
 ORANGE = (0.9, 0.45, 0.1, 1.0)
 #: Servo stiffness (N m/rad) by part of the joint's name; force limits are the table's.
-STIFFNESS = {"lumbar": 1800.0, "hip": 800.0, "knee": 400.0, "ankle": 200.0, "shoulder": 350.0, "elbow": 200.0, "wrist": 60.0}
+STIFFNESS = {"lumbar": 1800.0, "hip": 800.0, "knee": 400.0, "ankle": 200.0, "shoulder": 250.0, "elbow": 200.0, "wrist": 60.0}
 FORCE = {"ankle": 18.0, "hip_roll": 50.0, "hip_yaw": 50.0}
 FORCE_DEFAULT = 150.0
 FINGER_TRAVEL_M = 0.06
