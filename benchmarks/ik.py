@@ -1,10 +1,10 @@
 """Inverse kinematics: success, residuals and time per solve of both robots. `python benchmarks/ik.py [--count N] [--out FILE]`.
 
-Three sets of targets. `grid`: hand poses on a grid before the robot at several pelvis heights, fingers ahead and palms inward, as the
-paper's solvers take them (X1 each arm alone, H1 both hands at once), with and without the rows that keep the robot out of itself;
-success is then a property of the robot's reach, and its table is printed first. `sampled`: grasp poses of random arm postures before
-the body that do not run into it, so every target has a solution and success should be near 100 %. `table`: points on a grid over
-tables in front of the robot, as in a side grasp; `at some height` shows what crouching adds. `--grid` does the first set only.
+Three sets of targets. `grid`: hand poses on a grid before the robot at several pelvis heights, fingers ahead and palms inward,
+as the paper's solvers take them (X1 each arm, H1 both hands at once), with and without the rows that keep the robot out of
+itself; success is a property of the robot's reach. `sampled`: grasp poses of random arm postures that do not run into the
+body, so every target has a solution and success should be near 100 %. `table`: points on a grid over tables in front of the
+robot, as in a side grasp; `at some height` shows what crouching adds. `--grid` does the first set only.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from sim.robots.self_collision import SELF_TOUCH_M
 from sim.robots.solver import ArmSolver, IkResult, ReachTarget, rotation_from_axes
 from sim.robots.spec import SIDES, available_robots
 
-#: The grid: shares of the arm's reach ahead of the pelvis, metres left of it (right for the right arm), shares of the reach above
-#: the shoulder.
+#: The grid: shares of the arm's reach ahead of the pelvis, metres left of it (right for the right arm), shares of the reach
+#: above the shoulder.
 AHEAD, ASIDE_M, ABOVE = (0.3, 0.45, 0.6, 0.75, 0.9), (0.05, 0.15, 0.25, 0.35), (-0.9, -0.6, -0.3, 0.0, 0.3)
 HEIGHTS = 3
 TOLERANCE_M = 0.01
@@ -92,9 +92,7 @@ def report_grid(kit: RobotKit) -> dict[str, dict[str, float]]:
     found: dict[str, dict[str, float]] = {}
     solvers = {on: SOLVERS[kit.spec.solver](kit.model, kit.crouches, on == "on") for on in ("off", "on")}
     sets = (SIDES,) if kit.spec.solver == "whole_body" else tuple((side,) for side in SIDES)
-    print(
-        "\n| robot | arms | pelvis m | rows | success % | mm (95 %) | degrees (95 %) | balance mm | self-collision % | ms (mean) |"
-    )
+    print("\n| robot | arms | pelvis m | rows | success % | mm (95 %) | degrees (95 %) | balance mm | inside % | ms |")
     print("|---|---|---|---|---|---|---|---|---|---|")
     for arms in sets:
         everything: dict[str, tuple[list[IkResult], list[float]]] = {on: ([], []) for on in solvers}
@@ -111,7 +109,8 @@ def report_grid(kit: RobotKit) -> dict[str, dict[str, float]]:
                 found[f"{'+'.join(arms)} {name} {on}"] = row
                 print(
                     f"| {kit.spec.name} | {'+'.join(arms)} | {name} | {on} | {row['success_percent']:.0f} | "
-                    f"{row['error_mm']:.1f} ({row['error_p95_mm']:.1f}) | {row['error_deg']:.1f} ({row['error_p95_deg']:.0f}) | "
+                    f"{row['error_mm']:.1f} ({row['error_p95_mm']:.1f}) | "
+                    f"{row['error_deg']:.0f} ({row['error_p95_deg']:.0f}) | "
                     f"{row['balance_min_mm']:.0f} | {row['self_collision_percent']:.0f} | "
                     f"{row['ms_median']:.1f} ({row['ms_mean']:.1f}) |",
                     flush=True,

@@ -1,7 +1,7 @@
 """Step responses of every servo: overshoot, settling, error. `python benchmarks/servos.py [--picture FILE]`.
 
-Every joint in turn is told to jump by 0.2 rad (slides 2 cm, the base's slides 10 cm and its lean 0.1 rad) from rest, and is watched
-at 5 ms for a second; skills never ask for a jump, so this is the worst case.
+Every joint in turn is told to jump by 0.2 rad (slides 2 cm, the base's slides 10 cm and its lean 0.1 rad) from rest, and is
+watched at 5 ms for a second; skills never ask for a jump, so this is the worst case.
 """
 
 from __future__ import annotations

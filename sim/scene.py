@@ -51,8 +51,8 @@ MOVABLE_BITS: Final = (2, 23)
 HELD_BITS: Final = (8, 27)
 HELD_DOOR_BITS: Final = (16, 0)
 
-#: Position gain and damping ratio of the base servos, 20 ms to 30 ms behind their targets. Arms that reach out add inertia to the
-#: turns, so these are damped more.
+#: Position gain and damping ratio of the base servos, 20 ms to 30 ms behind their targets. Arms that reach out add inertia to
+#: the turns, so these are damped more.
 _BASE_GAINS: Final = {"base_x": 2.0e5, "base_y": 2.0e5, "base_z": 3.0e5, "base_yaw": 2.5e4, "base_pitch": 2.5e4}
 _BASE_DAMPING: Final = {"base_yaw": 1.4, "base_pitch": 1.4}
 _ARENA_BYTES: Final = 8 << 20

@@ -2,7 +2,7 @@
 
 Each iteration solves Pink's quadratic program: minimise the weighted task errors subject to joint position and velocity limits
 and to the rows that keep the robot out of itself (`self_collision`),
-    min_v  sum_i || J_i v dt + alpha e_i ||^2_{W_i} + lambda || v ||^2    s.t.  q_min <= q + v dt <= q_max,  |v| <= v_max,  C v <= c
+    min_v  sum_i || J_i v dt + alpha e_i ||^2_{W_i} + lambda || v ||^2  s.t.  q_min <= q + v dt <= q_max, |v| <= v_max, C v <= c
 with frame tasks for the grasp sites, a posture task that keeps redundant joints near their start, and, for whole-body solves, a
 centre-of-mass task. Legs and lean are those of the crouch at the given pelvis height. Thousands of solves precede a grasp, so
 tasks and limits are Pink's classes with what is constant kept, and DAQP is called directly.

@@ -13,7 +13,7 @@ with n from a to b and p the nearest points. Overlapping pairs have a negative b
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import coal
 import mujoco
@@ -208,8 +208,8 @@ def _pairs(geometry: pin.GeometryModel) -> list[tuple[int, int]]:
     return [(pair.first, pair.second) for pair in geometry.collisionPairs]
 
 
-def _solid(shape: BodyShape) -> tuple[coal.CollisionGeometry, pin.SE3]:
-    """A shape and where it is in its body's frame."""
+def _solid(shape: BodyShape) -> tuple[Any, pin.SE3]:
+    """Coal's solid of a shape, and where it is in its body's frame."""
     start = np.asarray(shape.start, dtype=float)
     if shape.half_m is not None:
         return coal.Box(*(2.0 * half for half in shape.half_m)), pin.SE3(np.eye(3), start)
@@ -256,7 +256,7 @@ def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Array:
 
 
 def _capsule_around(body: str, points: Array) -> BodyShape:
-    """A capsule about the middle of points (N, 3), as wide as their root mean square distance across and as long as they are."""
+    """A capsule about the middle of points (N, 3), as wide as their root mean square distance across, as long as they are."""
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     away = points - middle
     axis = np.linalg.svd(away, full_matrices=False)[2][0]
