@@ -56,15 +56,15 @@ def grid_targets(kit: RobotKit, height_m: float) -> list[dict[str, ReachTarget]]
 
 
 def run_grid(kit: RobotKit, solver: ArmSolver, arms: tuple[str, ...], height_m: float) -> tuple[list[IkResult], list[float]]:
-    """Results and seconds of all targets of one pelvis height."""
+    """Results and processor seconds of all targets of one pelvis height."""
     start = kit.crouches.at(height_m).q
     results, seconds = [], []
     targets = [{arm: pair[arm] for arm in arms} for pair in grid_targets(kit, height_m)]
     solver.solve(targets[0], start, pelvis_height_m=height_m)  # the model of a height is made once
     for target in targets:
-        begin = time.perf_counter()
+        begin = time.process_time()
         results.append(solver.solve(target, start, pelvis_height_m=height_m, tolerance_m=TOLERANCE_M))
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(time.process_time() - begin)
     return results, seconds
 
 
