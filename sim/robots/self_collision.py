@@ -38,7 +38,7 @@ SELF_TOUCH_M: Final = 0.005
 _NEIGHBOUR_M: Final = 0.005
 #: Distance that the rows keep, distance from which a pair has a row, share of the way to it that one iteration may go.
 _KEEP_M: Final = 0.0
-_NEAR_M: Final = 0.04
+_NEAR_M: Final = 0.1
 _GAIN: Final = 0.8
 #: What one iteration drives overlapping shapes apart at most: more would ask for what the joints cannot do in one step.
 _ESCAPE_M: Final = 0.03
