@@ -51,8 +51,10 @@ MOVABLE_BITS: Final = (2, 23)
 HELD_BITS: Final = (8, 27)
 HELD_DOOR_BITS: Final = (16, 0)
 
-#: Position gain and force limit of the base servos; critically damped through `dampratio`, 20 ms to 30 ms behind their targets.
+#: Position gain and damping ratio of the base servos, 20 ms to 30 ms behind their targets. Arms that reach out add inertia to
+#: the turns, so these are damped more.
 _BASE_GAINS: Final = {"base_x": 2.0e5, "base_y": 2.0e5, "base_z": 3.0e5, "base_yaw": 2.5e4, "base_pitch": 2.5e4}
+_BASE_DAMPING: Final = {"base_yaw": 1.4, "base_pitch": 1.4}
 _ARENA_BYTES: Final = 8 << 20
 _WALLS: Final = ("north", "east", "south", "west")
 _CEILING: Final = (0.97, 0.97, 0.95)
@@ -423,7 +425,7 @@ def _mount_robot(spec: mujoco.MjSpec, key: SceneKey) -> None:
     root.add_camera(name="top", pos=[0.0, 0.0, 3.2], fovy=60.0, quat=_quat([0, -1, 0], [1, 0, 0]))
     for name in BASE_JOINTS:
         servo = spec.add_actuator(name=name, target=name, trntype=int(mujoco.mjtTrn.mjTRN_JOINT))
-        servo.set_to_position(kp=_BASE_GAINS[name], dampratio=1.0)
+        servo.set_to_position(kp=_BASE_GAINS[name], dampratio=_BASE_DAMPING.get(name, 1.0))
     for arm, body in zip(("left", "right"), key.hand_bodies, strict=True):
         for kind, eq in (("weld", mujoco.mjtEq.mjEQ_WELD), ("ball", mujoco.mjtEq.mjEQ_CONNECT)):
             # Both ends name real bodies; the second end and the relative pose are set by World.attach.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sim.robots.crouch_table import CrouchTable
 from sim.robots.kinematics import RobotModel
 from sim.robots.pink_core import PinkCore
+from sim.robots.self_collision import SELF_TOUCH_M
 from sim.robots.solver import IkResult, ReachTarget
 
 __all__ = ["PerArmSolver"]
@@ -18,10 +19,20 @@ Array = NDArray[np.float64]
 
 
 class PerArmSolver:
-    """Solves the arms one after the other, each with its own joints only."""
+    """Solves the arms one after the other, each with its own joints only and clear of where the other one is then.
 
-    def __init__(self, robot: RobotModel, crouches: CrouchTable) -> None:
-        self._cores = {arm: PinkCore(robot, crouches, spec.joints, balance=False) for arm, spec in robot.spec.arms.items()}
+    Args:
+        robot: kinematics.
+        crouches: legs and lean by pelvis height.
+        avoid_self: whether the robot keeps out of itself; without, it is measured only.
+    """
+
+    def __init__(self, robot: RobotModel, crouches: CrouchTable, avoid_self: bool = True) -> None:
+        self._robot = robot
+        self._cores = {
+            arm: PinkCore(robot, crouches, spec.joints, balance=False, avoid_self=avoid_self)
+            for arm, spec in robot.spec.arms.items()
+        }
 
     def solve(
         self,
@@ -42,18 +53,20 @@ class PerArmSolver:
             part = self._cores[arm].solve(
                 {arm: targets[arm]}, q if result is None else result.q, dq, pelvis_height_m, tolerance_m, restarts
             )
-            result = part if result is None else _joined(result, part)
+            result = part if result is None else self._joined(result, part)
         if result is None:
             raise AssertionError("targets were checked above")
         return result
 
-
-def _joined(first: IkResult, second: IkResult) -> IkResult:
-    return IkResult(
-        second.q,
-        first.success and second.success,
-        max(first.position_error_m, second.position_error_m),
-        max(first.rotation_error_rad, second.rotation_error_rad),
-        second.balance_margin_m,
-        first.iterations + second.iterations,
-    )
+    def _joined(self, first: IkResult, second: IkResult) -> IkResult:
+        # the first arm kept clear of where the second one was before
+        clearance = self._robot.own_body.clearance_m(second.q)
+        return IkResult(
+            second.q,
+            first.success and second.success and clearance >= -SELF_TOUCH_M,
+            max(first.position_error_m, second.position_error_m),
+            max(first.rotation_error_rad, second.rotation_error_rad),
+            second.balance_margin_m,
+            first.iterations + second.iterations,
+            clearance,
+        )

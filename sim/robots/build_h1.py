@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sim.robots.build_common import HAND_FRICTION, ROBOT_AFFINITY, ROBOT_BIT, add_landmarks, add_servo, tune_joint
+from sim.robots.build_common import HAND_FRICTION, ROBOT_AFFINITY, ROBOT_BIT, add_landmarks, add_servo, damp_servos, tune_joint
 from sim.robots.csv_tree import LinkRow, add_link, read_rows
 
 __all__ = ["build_h1", "reduce_mesh"]
@@ -26,10 +26,10 @@ FACES = {"torso_link": 2000, "pelvis": 450}
 FACES_DEFAULT = 360
 #: Servo stiffness (N m/rad) and force limit (N m) by part of the joint's name; limits are Unitree's.
 SERVOS = {
-    "hip": (400.0, 200.0),
+    "hip": (1200.0, 200.0),
     "knee": (500.0, 300.0),
     "ankle": (200.0, 40.0),
-    "torso": (600.0, 200.0),
+    "torso": (1200.0, 200.0),
     "shoulder_pitch": (300.0, 40.0),
     "shoulder_roll": (300.0, 40.0),
     "shoulder_yaw": (150.0, 18.0),
@@ -196,6 +196,7 @@ def build_h1(menagerie: Path, table: Path, target: Path) -> None:
             armature = 0.02 if "hand" in joint.name else 0.1
             tune_joint(joint, armature, damping=2.0 * float(np.sqrt(servo[0] * armature)))
             add_servo(spec, joint, *servo)
+    damp_servos(spec)
     for body in spec.bodies[1:]:
         body.gravcomp = 1.0
     pitch = np.radians(40.0)  # the head looks down at tables

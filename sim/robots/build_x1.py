@@ -17,6 +17,7 @@ from sim.robots.build_common import (
     ROBOT_BIT,
     add_landmarks,
     add_servo,
+    damp_servos,
     shell,
     shell_box,
     tune_joint,
@@ -30,7 +31,7 @@ WHITE = (0.86, 0.87, 0.9, 1.0)
 GREY = (0.35, 0.37, 0.42, 1.0)
 ORANGE = (0.9, 0.45, 0.1, 1.0)
 #: Servo stiffness (N m/rad) by part of the joint's name; force limits are the table's.
-STIFFNESS = {"lumbar": 600.0, "hip": 400.0, "knee": 400.0, "ankle": 200.0, "shoulder": 250.0, "elbow": 200.0, "wrist": 60.0}
+STIFFNESS = {"lumbar": 1800.0, "hip": 800.0, "knee": 400.0, "ankle": 200.0, "shoulder": 250.0, "elbow": 200.0, "wrist": 60.0}
 FORCE = {"ankle": 18.0, "hip_roll": 50.0, "hip_yaw": 50.0}
 FORCE_DEFAULT = 150.0
 FINGER_TRAVEL_M = 0.06
@@ -145,6 +146,7 @@ def build_x1(table: Path, target: Path) -> None:
         armature = 0.02 if "wrist" in joint.name else 0.08
         tune_joint(joint, armature, damping=2.0 * float(np.sqrt(stiffness * armature)))
         add_servo(spec, joint, stiffness, next((v for part, v in FORCE.items() if part in joint.name), FORCE_DEFAULT))
+    damp_servos(spec)
     for body in spec.bodies[1:]:
         body.gravcomp = 1.0
     origin, rotation = pose[trunk]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull
 
+from sim.robots.self_collision import OwnBody
 from sim.robots.spec import KEY_BODIES, RobotSpec
 
 __all__ = ["RobotModel", "root_quaternion"]
@@ -39,6 +41,11 @@ class RobotModel:
         self.lower: Array = self.model.lowerPositionLimit[self._q_index].copy()
         self.upper: Array = self.model.upperPositionLimit[self._q_index].copy()
         self._key_frames = [self.frame_id(spec.key_bodies[name]) for name in KEY_BODIES]
+
+    @cached_property
+    def own_body(self) -> OwnBody:
+        """The robot's shapes, for distances to itself."""
+        return OwnBody(self)
 
     def frame_id(self, name: str) -> int:
         """Pinocchio frame of a body or site.

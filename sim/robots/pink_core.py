@@ -1,7 +1,8 @@
 """Differential inverse kinematics on pin-pink, iterated to convergence, shared by the two arm solvers.
 
-Each iteration solves Pink's quadratic program: minimise the weighted task errors subject to joint position and velocity limits,
-    min_v  sum_i || J_i v dt + alpha e_i ||^2_{W_i} + lambda || v ||^2    s.t.  q_min <= q + v dt <= q_max,  |v| <= v_max
+Each iteration solves Pink's quadratic program: minimise the weighted task errors subject to joint position and velocity limits
+and to the rows that keep the robot out of itself (`self_collision`),
+    min_v  sum_i || J_i v dt + alpha e_i ||^2_{W_i} + lambda || v ||^2  s.t.  q_min <= q + v dt <= q_max, |v| <= v_max, C v <= c
 with frame tasks for the grasp sites, a posture task that keeps redundant joints near their start, and, for whole-body solves, a
 centre-of-mass task. Legs and lean are those of the crouch at the given pelvis height. Thousands of solves precede a grasp, so
 tasks and limits are Pink's classes with what is constant kept, and DAQP is called directly.
@@ -17,12 +18,14 @@ import daqp
 import numpy as np
 import pink
 import pinocchio as pin
+import qpsolvers
 from numpy.typing import NDArray
 from pink.limits import ConfigurationLimit, Limit, VelocityLimit
 from pink.tasks import ComTask, FrameTask, PostureTask, Task
 
 from sim.robots.crouch_table import CrouchTable
 from sim.robots.kinematics import RobotModel, root_quaternion
+from sim.robots.self_collision import SELF_TOUCH_M, SelfLimit
 from sim.robots.solver import IkResult, ReachTarget
 
 __all__ = ["PinkCore"]
@@ -45,27 +48,26 @@ _BANK_SIZE = 160
 _CACHED = 256
 #: What the solver takes for minus infinity.
 _UNBOUNDED = -1e30
+_NO_ROWS = np.zeros((0, 64))
+_NO_BOUNDS = np.zeros(0)
 
 
-class _JointLimits(Limit):
-    """Pink's limits of joint positions and velocities, with the part that does not depend on the configuration kept."""
+class _JointLimits:
+    """Pink's limits of joint positions and velocities, as one interval per joint: the solver takes those as such."""
 
     def __init__(self, model: pin.Model) -> None:
         position, velocity = ConfigurationLimit(model), VelocityLimit(model)
-        self._model = model
-        self._columns = position.indices
-        self._gain = position.config_limit_gain
-        if position.projection_matrix is None or velocity.projection_matrix is None:
+        if len(position.indices) != model.nv or len(velocity.indices) != model.nv:
             raise ValueError("a robot whose movable joints have no limits cannot be solved for")
-        rows = (position.projection_matrix, velocity.projection_matrix)
-        self._matrix: Array = np.vstack([sign * part for part in rows for sign in (1.0, -1.0)])
-        self._step: Array = np.tile(velocity.velocity_limit[velocity.indices], 2)
+        self._model = model
+        self._gain = position.config_limit_gain
+        self._step: Array = _DT_S * velocity.velocity_limit
 
-    def compute_qp_inequalities(self, configuration: pink.Configuration, dt: float) -> tuple[Array, Array]:
-        """See `pink.limits.Limit`."""
-        up = pin.difference(self._model, configuration.q, self._model.upperPositionLimit)[self._columns]
-        down = pin.difference(self._model, configuration.q, self._model.lowerPositionLimit)[self._columns]
-        return self._matrix, np.concatenate([self._gain * up, -(self._gain * down), dt * self._step])
+    def interval(self, q: Array) -> tuple[Array, Array]:
+        """(N,) least and largest change of each joint in one iteration from the positions `q`."""
+        down = self._gain * pin.difference(self._model, q, self._model.lowerPositionLimit)
+        up = self._gain * pin.difference(self._model, q, self._model.upperPositionLimit)
+        return np.maximum(down, -self._step), np.minimum(up, self._step)
 
 
 class _HandTask(FrameTask):
@@ -119,18 +121,47 @@ class _Reduced:
         model, data: Pinocchio's.
         order: (movable,) where each movable joint is in the model's configuration.
         limits: of the model.
+        own: what keeps the robot out of itself.
     """
 
     model: pin.Model
     data: pin.Data
     order: NDArray[np.int64]
     limits: _JointLimits
+    own: SelfLimit
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """Where a start led to.
+
+    Attributes:
+        error_m, angle_rad: largest errors of position and pointing over the targeted arms.
+        clearance_m: distance of the robot to itself, negative inside.
+        posture: (movable,) joints.
+    """
+
+    error_m: float
+    angle_rad: float
+    clearance_m: float
+    posture: Array
+
+    def reached(self, tolerance_m: float) -> bool:
+        """Whether the position is, without running into the robot itself."""
+        return self.error_m <= tolerance_m and self.clearance_m >= -SELF_TOUCH_M
+
+    @property
+    def cost_m(self) -> float:
+        """What makes one outcome worse than another."""
+        return self.error_m + 0.002 * self.angle_rad + max(0.0, -SELF_TOUCH_M - self.clearance_m)
 
 
 class PinkCore:
     """Solves for the grasp sites of the given arms with the given movable joints."""
 
-    def __init__(self, robot: RobotModel, crouches: CrouchTable, movable: Sequence[str], balance: bool) -> None:
+    def __init__(
+        self, robot: RobotModel, crouches: CrouchTable, movable: Sequence[str], balance: bool, avoid_self: bool = True
+    ) -> None:
         self.robot = robot
         self._crouches = crouches
         self._movable = robot.indices(tuple(movable))
@@ -145,6 +176,8 @@ class PinkCore:
         spread = np.random.default_rng(0).uniform(-1.6, 1.6, (_BANK_SIZE, len(low)))
         self._bank: Array = np.clip(centre + spread, low + 1e-3, high - 1e-3)  # (B, movable) postures to restart from
         self._owner = np.array([self._arm_of(name) for name in self._full_names])
+        self._arms = sorted(set(self._owner) - {""})
+        self._avoid_self = avoid_self
 
     def _model_at(self, pelvis_height_m: float) -> _Reduced:
         """Reduced model with the root and all other joints locked at the crouch.
@@ -156,12 +189,15 @@ class PinkCore:
             root = np.array([0.0, 0.0, 0.0, *root_quaternion(0.0, self._crouches.pitch(height))])
             reference = self.robot.configuration(root, self._crouches.posture(height))
             root_id = 1
-            reduced = pin.buildReducedModel(self.robot.model, [root_id, *self._locked], reference)
+            geometry = self.robot.own_body.geometry
+            reduced, solids = pin.buildReducedModel(self.robot.model, geometry, [root_id, *self._locked], reference)
+            self.robot.own_body.leave_pairs(solids, self._arms)
             reduced.velocityLimit = np.full(reduced.nv, _STEP_RAD / _DT_S)
             order = np.array([reduced.joints[reduced.getJointId(name)].idx_q for name in self._full_names])
             if len(self._reduced) >= _CACHED:
                 self._reduced.clear()
-            self._reduced[height] = _Reduced(reduced, reduced.createData(), order, _JointLimits(reduced))
+            data = reduced.createData()
+            self._reduced[height] = _Reduced(reduced, data, order, _JointLimits(reduced), SelfLimit(reduced, data, solids))
         return self._reduced[height]
 
     def solve(
@@ -183,8 +219,9 @@ class PinkCore:
         warm = np.clip(q[self._movable], lower + 1e-4, upper - 1e-4)
         if dq is not None:  # start where the arm will be after one control period
             warm = np.clip(warm + 0.02 * np.asarray(dq)[self._movable], lower + 1e-4, upper - 1e-4)
+        self._pose_others(reduced, q, pelvis_height_m)
         ranked: dict[str, NDArray[np.int64]] | None = None
-        best: tuple[float, float, float, Array] | None = None
+        best: _Found | None = None
         iterations = 0
         for attempt in range(restarts + 1):
             if attempt >= 2 and ranked is None:
@@ -192,18 +229,31 @@ class PinkCore:
             start = warm if attempt == 0 else self._restart(warm, lower, upper, ranked, attempt)
             found, used = self._attempt(reduced, targets, start, tolerance_m, oriented_first=attempt == 0)
             iterations += used
-            error, angle, posture = found
-            cost = max(error, 0.0) + 0.002 * angle
-            if best is None or (error <= tolerance_m, -cost) > (best[0] <= tolerance_m, -best[2]):
-                best = (error, angle, cost, posture)
-            if best[0] <= tolerance_m and (best[1] < 0.9 or attempt >= 1):
+            if best is None or (found.reached(tolerance_m), -found.cost_m) > (best.reached(tolerance_m), -best.cost_m):
+                best = found
+            if best.reached(tolerance_m) and (best.angle_rad < 0.9 or attempt >= 1):
                 break
         if best is None:
             raise AssertionError("at least one attempt is made")
         out = self._crouches.apply(q, pelvis_height_m)
-        out[self._movable] = best[3]
+        out[self._movable] = best.posture
         margin = self._crouches.balance_margin(out, pelvis_height_m)
-        return IkResult(out, best[0] <= tolerance_m and margin > 0.0, best[0], best[1], margin, iterations)
+        success = best.reached(tolerance_m) and margin > 0.0
+        return IkResult(out, success, best.error_m, best.angle_rad, margin, iterations, best.clearance_m)
+
+    def _pose_others(self, reduced: _Reduced, q: Array, pelvis_height_m: float) -> None:
+        """An arm that does not move here is where `q` has it, not where the reduced model was locked."""
+        if len(self._arms) == len(self.robot.spec.arms):
+            return
+        height = self._crouches.clamp(pelvis_height_m)
+        posture = self._crouches.posture(height)
+        for arm, spec in self.robot.spec.arms.items():
+            if arm not in self._arms:
+                columns = self.robot.indices(spec.joints)
+                posture[columns] = q[columns]
+        root = np.array([0.0, 0.0, 0.0, *root_quaternion(0.0, self._crouches.pitch(height))])
+        self.robot.own_body.pose_others(reduced.own.geometry, root, posture, self._arms)
+        reduced.own.forget()
 
     def _arm_of(self, joint: str) -> str:
         return next((arm for arm, spec in self.robot.spec.arms.items() if joint in spec.joints), "")
@@ -246,7 +296,7 @@ class PinkCore:
         tolerance_m: float,
         *,
         oriented_first: bool,
-    ) -> tuple[tuple[float, float, Array], int]:
+    ) -> tuple[_Found, int]:
         """One start. Position goes before orientation: where both cannot be had, the hand turns as far as it must.
 
         The warm start relaxes the orientation until the position is reached; a restart first finds the position, then the
@@ -256,12 +306,11 @@ class PinkCore:
         ladder = (1.0,) if not oriented else _RELAXATIONS if oriented_first else _RELAXATIONS[::-1]
         found, iterations = self._descend(reduced, targets, start, tolerance_m, ladder[0])
         for relaxation in ladder[1:]:
-            reached = found[0] <= tolerance_m
-            if reached == oriented_first:
+            if found.reached(tolerance_m) == oriented_first:
                 break
-            following, used = self._descend(reduced, targets, found[2], tolerance_m, relaxation)
+            following, used = self._descend(reduced, targets, found.posture, tolerance_m, relaxation)
             iterations += used
-            if not oriented_first and following[0] > tolerance_m:
+            if not oriented_first and not following.reached(tolerance_m):
                 break
             found = following
         return found, iterations
@@ -273,7 +322,7 @@ class PinkCore:
         start: Array,
         tolerance_m: float,
         relaxation: float,
-    ) -> tuple[tuple[float, float, Array], int]:
+    ) -> tuple[_Found, int]:
         model, order = reduced.model, reduced.order
         full = pin.neutral(model)
         full[order] = start
@@ -300,32 +349,47 @@ class PinkCore:
             com = ComTask(cost=0.05)
             com.set_target_from_configuration(configuration)
             tasks.append(com)
+        limits: list[Limit] = [reduced.own] if self._avoid_self else []
         previous, error = np.inf, np.inf
+        before, clearance = -np.inf, -np.inf
         step = 0
         while step < _MAX_ITERATIONS:
             step += 1
-            problem = pink.build_ik(configuration, tasks, _DT_S, damping=1e-8, limits=[reduced.limits])
-            velocity = _solved(*(np.asarray(part) for part in (problem.P, problem.q, problem.G, problem.h))) / _DT_S
+            problem = pink.build_ik(configuration, tasks, _DT_S, damping=1e-8, limits=limits)
+            low, high = reduced.limits.interval(configuration.q)
+            velocity = _solved(problem, low, high) / _DT_S
             configuration.integrate_inplace(velocity, _DT_S)
             error = max(float(np.linalg.norm(task.compute_error(configuration)[:3])) for task, _ in hands)
             if error < 0.1 * tolerance_m or abs(previous - error) < max(_STALL_M, _STALL_FRACTION * error):
-                break
+                clearance = reduced.own.clearance_m(configuration)
+                leaving = clearance < -SELF_TOUCH_M and clearance > before + _STALL_M
+                if not (self._avoid_self and leaving):
+                    break
+                before = clearance
             previous = error
         angle = 0.0
         for task, target in hands:
             if target.rotation is not None and target.pointing_weight > 0.0:
                 reached = configuration.get_transform_frame_to_world(task.frame).rotation[:, 0]
                 angle = max(angle, float(np.arccos(np.clip(reached @ np.asarray(target.rotation)[:, 0], -1.0, 1.0))))
-        return (error, angle, np.asarray(configuration.q)[order].copy()), step
+        clearance = reduced.own.clearance_m(configuration)
+        return _Found(error, angle, clearance, np.asarray(configuration.q)[order].copy()), step
 
 
-def _solved(hessian: Array, gradient: Array, rows: Array, bounds: Array) -> Array:
-    """(N,) minimum of a convex quadratic program with rows @ x <= bounds.
+def _solved(problem: qpsolvers.Problem, low: Array, high: Array) -> Array:
+    """(N,) minimum of Pink's quadratic program between `low` and `high` (N,).
 
+    Bounds of rows below zero, which drive overlapping shapes apart, are given up where they contradict the others.
     The solver is asked directly: the checks and copies around it in `pink.solve_ik` took as long as the solution.
     """
-    free = np.full(len(bounds), _UNBOUNDED)
-    x, _, flag, _ = daqp.solve(hessian, gradient, rows, bounds, free, np.zeros(len(bounds), dtype=c_int))
+    rows = _NO_ROWS[:, : len(low)] if problem.G is None else np.asarray(problem.G)
+    bounds = _NO_BOUNDS if problem.h is None else np.asarray(problem.h)
+    below, kind = np.full(len(bounds), _UNBOUNDED), np.zeros(len(low) + len(bounds), dtype=c_int)
+    lower = np.concatenate([low, below])
+    x, _, flag, _ = daqp.solve(problem.P, problem.q, rows, np.concatenate([high, bounds]), lower, kind)
+    if flag <= 0:
+        upper = np.concatenate([high, np.maximum(bounds, 0.0)])
+        x, _, flag, _ = daqp.solve(problem.P, problem.q, rows, upper, lower, kind)
     if flag <= 0:
         raise ArithmeticError(f"inverse kinematics: the quadratic program has no solution (exit flag {flag})")
     return x

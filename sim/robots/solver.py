@@ -52,11 +52,12 @@ class IkResult:
 
     Attributes:
         q: (J,) joints; those that the solver does not own are as given.
-        success: every targeted arm within the position tolerance, and balanced.
+        success: every targeted arm within the position tolerance, balanced, and free of the robot's own body.
         position_error_m: largest position error over the targeted arms.
         rotation_error_rad: largest angle between wanted and reached pointing direction.
         balance_margin_m: distance of the centre of mass to the edge of the support polygon.
         iterations: steps taken, over all restarts.
+        self_clearance_m: distance of the arms that were solved for to trunk, legs and each other, negative when they overlap.
     """
 
     q: Array
@@ -65,6 +66,7 @@ class IkResult:
     rotation_error_rad: float
     balance_margin_m: float
     iterations: int
+    self_clearance_m: float
 
 
 class ArmSolver(Protocol):

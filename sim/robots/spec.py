@@ -18,7 +18,7 @@ import yaml
 from configs.assets import asset_files
 from configs.validate import ConfigError, build
 
-__all__ = ["KEY_BODIES", "SIDES", "ArmSpec", "FootSpec", "HandSpec", "RobotSpec", "available_robots", "load_robot"]
+__all__ = ["KEY_BODIES", "SIDES", "ArmSpec", "BodyShape", "FootSpec", "HandSpec", "RobotSpec", "available_robots", "load_robot"]
 
 SIDES = ("left", "right")
 #: Bodies whose positions make up a motion frame, in this order, shared by all robots (and matched to SMPL joints in `data`).
@@ -107,6 +107,28 @@ class HandSpec:
 
 
 @dataclass(frozen=True, slots=True)
+class BodyShape:
+    """A capsule, or a box when `half_m` is given, that stands for a part of the robot when it avoids itself.
+
+    Attributes:
+        body: MJCF body, in whose frame the shape is.
+        start, end: (3,) ends of the capsule's axis; `start` is the middle of a box. Metres.
+        radius_m: of the capsule.
+        half_m: (3,) half edges of the box along the body's axes.
+    """
+
+    body: str
+    start: tuple[float, float, float]
+    end: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radius_m: float = 0.0
+    half_m: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if min(self.half_m or (self.radius_m,)) <= 0.0:
+            raise ValueError(f"shape of {self.body}: needs a radius_m, or half_m, above 0")
+
+
+@dataclass(frozen=True, slots=True)
 class RobotSpec:
     """A dual-arm humanoid.
 
@@ -127,6 +149,7 @@ class RobotSpec:
         two_arm_max_load_kg: heaviest object both arms carry.
         max_joint_velocity: rad/s for trajectories and inverse kinematics.
         solver: inverse kinematics of waist and both arms together, or of each arm alone.
+        self_shapes: what the arms must not run into and what they are themselves; none: from the MJCF's geoms.
         joints: every scalar joint of the MJCF in its order (read from the file).
     """
 
@@ -146,6 +169,7 @@ class RobotSpec:
     two_arm_max_load_kg: float
     max_joint_velocity: float
     solver: Literal["whole_body", "per_arm"]
+    self_shapes: tuple[BodyShape, ...] = ()
     mjcf_path: Path = field(default=Path())
     joints: tuple[str, ...] = ()
 

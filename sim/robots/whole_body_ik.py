@@ -22,12 +22,18 @@ Array = NDArray[np.float64]
 
 
 class WholeBodySolver:
-    """Solves waist and both arms together; an arm without a target keeps its posture as well as it can."""
+    """Solves waist and both arms together; an arm without a target keeps its posture as well as it can.
 
-    def __init__(self, robot: RobotModel, crouches: CrouchTable) -> None:
+    Args:
+        robot: kinematics.
+        crouches: legs and lean by pelvis height.
+        avoid_self: whether the robot keeps out of itself; without, it is measured only.
+    """
+
+    def __init__(self, robot: RobotModel, crouches: CrouchTable, avoid_self: bool = True) -> None:
         spec = robot.spec
         movable = (*spec.waist_joints, *spec.arms["left"].joints, *spec.arms["right"].joints)
-        self._core = PinkCore(robot, crouches, movable, balance=True)
+        self._core = PinkCore(robot, crouches, movable, balance=True, avoid_self=avoid_self)
 
     def solve(
         self,

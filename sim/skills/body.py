@@ -29,6 +29,7 @@ from sim.placement import OVERHANG_SHARE
 from sim.robots.arm_ik import PerArmSolver
 from sim.robots.build_solver import RobotKit, robot_kit
 from sim.robots.footsteps import footsteps
+from sim.robots.self_collision import SELF_TOUCH_M
 from sim.robots.solver import ReachTarget
 from sim.scene import BASE_JOINTS
 from sim.skills.clearance import ClearanceProbe
@@ -468,7 +469,9 @@ class Body:
         pointing_weight: float = 0.1,
         roll_weight: float = 0.1,
     ) -> ArmGoal:
-        """Solves one arm for a hand pose given in the world, waist straight.
+        """Solves one arm for a hand pose given in the world, waist straight, the other arm where it is told to be.
+
+        An arm that is wound up or inside the robot's own body counts as far from its wish.
 
         Args:
             arm: which one.
@@ -496,6 +499,8 @@ class Body:
             starts = [start]
         best: tuple[float, ArmGoal] | None = None
         q = self.kinematics.posture()
+        for other in Arm:
+            q[self._columns[other]] = self.commanded_arm(other)
         root = np.array([0.0, 0.0, 0.0, *_quaternion_about_y(self.crouches.pitch(height))])
         site = (self.spec.arms[arm.value].grasp_site,)
         for candidate in starts:
@@ -518,9 +523,10 @@ class Body:
             along = 1.0 if local.closing is None else float(reached[:, 1] @ local.closing)
             q_arm = result.q[self._columns[arm]].copy()
             wound = float(np.max(np.abs(q_arm - np.asarray(self.spec.arms[arm.value].carry))[:-1]))
+            sound = wound < WOUND_RAD + 0.3 and result.self_clearance_m >= -SELF_TOUCH_M
             goal = ArmGoal(
                 q_arm,
-                result.position_error_m if wound < WOUND_RAD + 0.3 else 1.0,
+                result.position_error_m if sound else 1.0,
                 pointing,
                 abs(along) if local.either_way else along,
                 self.turn_to_world(reached[:, 0]),
@@ -558,7 +564,8 @@ class Body:
         result = self.whole_body.solve(targets, q, pelvis_height_m=height, restarts=1, tolerance_m=REACH_TOLERANCE_M)
         waist = self.kinematics.indices(self.spec.waist_joints)
         arms = {arm: result.q[self._columns[arm]].copy() for arm in Arm}
-        return BothGoal(arms, result.q[waist].copy(), result.position_error_m, result.rotation_error_rad)
+        error = result.position_error_m if result.self_clearance_m >= -SELF_TOUCH_M else 1.0
+        return BothGoal(arms, result.q[waist].copy(), error, result.rotation_error_rad)
 
     def heights(self) -> list[float]:
         """A grid over the robot's pelvis heights, metres."""
@@ -692,6 +699,7 @@ def ready_posture(kit: RobotKit, arm: Arm, raised: bool = False) -> Array:
             + (1.0 - float(hand[:3, 1] @ inward))
             + 0.04 * float(away @ away)
             + 6.0 * max(low, 0.0)
+            + 50.0 * max(-result.self_clearance_m, 0.0)
         )
         if best is None or cost < best[0]:
             best = (cost, result.q[columns].copy())

@@ -3,7 +3,7 @@
 Inverse kinematics with few degrees of freedom (H1: five per arm) has local minima and no room for an arbitrary hand
 orientation. The table answers both: for a point it gives the posture whose hand points best, as the start of the solver, and it
 tells at which other pelvis heights the point would be in reach. Sampling is uniform over the joint ranges, with a fixed seed,
-once per robot and machine.
+once per robot and machine; postures that put the arm well into the trunk or the head are left out.
 
 Frames: `pelvis` is the pelvis heading frame. Shape letters: S samples, A arm joints.
 """
@@ -32,10 +32,12 @@ Array = NDArray[np.float64]
 
 _SAMPLES: Final = 80000
 #: Raised when the meaning of the arrays changes.
-_VERSION: Final = 1
+_VERSION: Final = 2
 _FIELDS: Final = ("q", "positions", "x_axes", "y_axes", "shoulder")
 #: Postures that are farther than this from the carrying one in any joint are left out: such arms are wound up.
 WOUND_RAD: Final = 2.0
+#: Postures that put the arm deeper than this into trunk or head are left out; the solver brings an arm out of less.
+_INSIDE_M: Final = 0.03
 #: A point counts as within the envelope when a sampled hand is at most this far from it.
 _ENVELOPE_M: Final = 0.045
 #: Weight of the position error (per metre) against the orientation error (1 - cosine) when a posture is chosen.
@@ -136,7 +138,9 @@ def reach_maps(kit: RobotKit) -> dict[str, ReachMap]:
     """The reach maps of a robot's `left` and `right` arm, waist straight; kept in the user's cache by all they depend on."""
     spec = kit.spec
     described = repr(dataclasses.replace(spec, mjcf_path=Path()))
-    key = hashlib.sha256(spec.mjcf_path.read_bytes() + f"{described}|{_SAMPLES}|{WOUND_RAD}|{_VERSION}".encode()).hexdigest()
+    key = hashlib.sha256(
+        spec.mjcf_path.read_bytes() + f"{described}|{_SAMPLES}|{WOUND_RAD}|{_INSIDE_M}|{_VERSION}".encode()
+    ).hexdigest()
     name = f"reach-{spec.name}-{key[:24]}"
     arrays = read_cached(name)
     if arrays is None or set(arrays) != {f"{side}/{field}" for side in spec.arms for field in _FIELDS}:
@@ -167,6 +171,7 @@ def _sampled(kit: RobotKit) -> dict[str, Array]:
         side: rng.uniform(robot.lower[index], robot.upper[index], (_SAMPLES, len(index))) for side, index in columns.items()
     }
     hands = {side: np.empty((_SAMPLES, 3, 3)) for side in spec.arms}  # rows: position, x axis, y axis
+    clear = {side: np.empty(_SAMPLES, dtype=bool) for side in spec.arms}
     full = base.copy()
     for i in range(_SAMPLES):
         for side in spec.arms:
@@ -176,12 +181,14 @@ def _sampled(kit: RobotKit) -> dict[str, Array]:
             pose = robot.data.oMf[frames[side]]
             hands[side][i, 0] = pose.translation
             hands[side][i, 1:] = pose.rotation[:, :2].T
+            # the legs are elsewhere in a crouch
+            clear[side][i] = robot.own_body.clearance_at_m(robot.data, (side,), ("trunk",)) >= -_INSIDE_M
     for side in spec.arms:
         pin.framesForwardKinematics(robot.model, robot.data, base)
         shoulder = robot.data.oMf[robot.frame_id(spec.key_bodies[f"{side}_shoulder"])].translation.copy()
         positions = hands[side][:, 0].copy()
         wound = np.abs(draws[side] - np.asarray(spec.arms[side].carry))[:, :-1].max(axis=1)  # the wrist may roll freely
-        sensible = (positions[:, 0] > -0.05) & (wound < WOUND_RAD)  # hands behind the back are of no use
+        sensible = (positions[:, 0] > -0.05) & (wound < WOUND_RAD) & clear[side]  # hands behind the back are of no use
         values = (draws[side][sensible], positions[sensible], hands[side][sensible, 1], hands[side][sensible, 2], shoulder)
         found |= {f"{side}/{field}": np.ascontiguousarray(value) for field, value in zip(_FIELDS, values, strict=True)}
     return found

@@ -17,12 +17,16 @@ def _root(kit, height):
 
 
 def _random_poses(kit, height, rng):
+    """Poses of the hands in a posture near the carrying one in which the robot does not run into itself."""
     q = kit.crouches.at(height).q
-    for arm in kit.spec.arms.values():
-        index = kit.model.indices(arm.joints)
-        q[index] = np.clip(
-            np.asarray(arm.carry) + rng.uniform(-0.6, 0.6, len(index)), kit.model.lower[index], kit.model.upper[index]
-        )
+    clear = False
+    while not clear:
+        for arm in kit.spec.arms.values():
+            index = kit.model.indices(arm.joints)
+            q[index] = np.clip(
+                np.asarray(arm.carry) + rng.uniform(-0.6, 0.6, len(index)), kit.model.lower[index], kit.model.upper[index]
+            )
+        clear = kit.model.own_body.clearance_m(q) > 0.01
     poses = kit.model.frames(_root(kit, height), q, tuple(kit.spec.arms[side].grasp_site for side in SIDES))
     return dict(zip(SIDES, poses, strict=True))
 
