@@ -224,6 +224,7 @@ class Controller:
             None,
             0.0,
             body.faces_rad(name),
+            body.fits,
         )
         if best is not None:
             stance = best[0]

@@ -43,6 +43,7 @@ class Rehearsal:
             action.amount,
             bearing,
             body.faces_rad(action.object_id),
+            body.fits,
         )
         return None if found is None else found[0]
 

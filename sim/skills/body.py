@@ -221,6 +221,11 @@ class Body:
         touching = np.prod(owner, axis=1) < 0
         return float(-np.min(data.contact.dist[: data.ncon][touching], initial=0.0))
 
+    def fits(self, stance: Stance) -> bool:
+        """Whether arms and hands, as they are commanded, would touch nothing at a stance."""
+        with self.considering_stance(stance):
+            return all(self.probe.free(arm, [self.commanded_arm(arm)]) for arm in Arm)
+
     def strain(self) -> float:
         """How far the hands' joints are bent beyond their limits: rad, and metres of sliding joints divided by 0.2."""
         model = self.world.model

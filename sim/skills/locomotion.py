@@ -9,7 +9,7 @@ Paper: body actions of the DualTHOR action space. GoTo replaces the paper's tele
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -45,6 +45,9 @@ _SIDESTEP_M: Final = 0.5
 _FACE_WEIGHT: Final = 3.0
 #: Preference of near over exact: metres of walking that one metre of deviation from the comfortable distance is worth.
 _DISTANCE_WEIGHT: Final = 6.0
+#: Stances that are asked whether the hands fit there, and how much more than the best one they may cost.
+_ASKED: Final = 16
+_WORSE: Final = 0.8
 
 
 def _turn(body: Body, yaw_rad: float) -> Skill:
@@ -201,6 +204,7 @@ def best_stance(
     distance_m: float | None,
     bearing_rad: float,
     faces_rad: Sequence[float] = (),
+    serves: Callable[[Stance], bool] | None = None,
 ) -> tuple[Stance, NDArray[np.float64]] | None:
     """The stance for GoTo and the way there.
 
@@ -212,6 +216,8 @@ def best_stance(
         distance_m: distance asked for, None for the most comfortable one that is free.
         bearing_rad: bearing of the object after arrival.
         faces_rad: directions out of the object in which it is best approached; any direction when empty.
+        serves: whether the robot fits at a stance, hands included; asked of a few, the best first. Where none of them
+            serves, the best one is taken.
 
     Returns:
         The stance and a polyline (N, 2) to it, None when no free stance can be reached.
@@ -227,9 +233,9 @@ def best_stance(
         stances = navigation.stances(target, [d for d in ring if d > 0.05], bearing_rad)
         if not stances:
             continue
-        best: tuple[float, Stance] | None = None
+        ranked: list[tuple[float, int, Stance]] = []
         costs = ways.costs_m(np.stack([stance.position for stance in stances]))
-        for stance, way_m in zip(stances, map(float, costs), strict=True):
+        for index, (stance, way_m) in enumerate(zip(stances, map(float, costs), strict=True)):
             off = abs(float(np.linalg.norm(stance.position - target)) - middle)
             turn = abs(wrap_angle(stance.yaw_rad - start.yaw_rad))
             cost = way_m + _DISTANCE_WEIGHT * off + 0.1 * turn
@@ -237,12 +243,15 @@ def best_stance(
                 delta = stance.position - target
                 side = float(np.arctan2(delta[1], delta[0]))
                 cost += _FACE_WEIGHT * min(abs(wrap_angle(side - face)) for face in faces_rad)
-            if np.isfinite(cost) and (best is None or cost < best[0] - 1e-9):
-                best = (cost, stance)
-        if best is not None:
-            path = ways.to(best[1].position)
+            if np.isfinite(cost):
+                ranked.append((round(cost, 9), index, stance))
+        if ranked:
+            ranked.sort(key=lambda entry: entry[:2])
+            near = [stance for cost, _, stance in ranked[:_ASKED] if cost <= ranked[0][0] + _WORSE]
+            chosen = next((stance for stance in near if serves is None or serves(stance)), near[0])
+            path = ways.to(chosen.position)
             assert path is not None
-            return best[1], path
+            return chosen, path
     return None
 
 
@@ -264,6 +273,7 @@ def go_to(body: Body, action: Action) -> Skill:
         action.amount,
         bearing,
         body.faces_rad(action.object_id),
+        body.fits,
     )
     if found is None:
         raise SkillFailure(FailureCode.NO_FREE_POSE)

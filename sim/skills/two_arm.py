@@ -41,7 +41,7 @@ _HOLDS: Final = ((0.3, 0.2), (0.3, 0.12), (0.3, 0.05), (0.25, 0.2), (0.25, 0.1),
 #: Sagging of what is held that is made up for.
 _SAG_M: Final = 0.015
 #: Radians of tilt that a metre of height is worth when one of them is chosen.
-_HEIGHT_WEIGHT: Final = 1.2
+_HEIGHT_WEIGHT: Final = 2.4
 
 
 @dataclass(frozen=True, slots=True)
