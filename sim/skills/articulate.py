@@ -268,11 +268,11 @@ def _lead(body: Body, arm: Arm, pull: Pull) -> Skill:
     travelled = np.array([min_jerk(k / steps) for k in range(steps + 1)])
     spots = base.position - pull.back_m * travelled[:, None] * ahead
     way = np.column_stack([spots, np.full(steps + 1, base.yaw_rad)])
-    legs = body.walking_legs(way) if pull.back_m > 0.0 else None
+    bases, legs = body.walking_targets(way)
     for k in range(1, steps + 1):
         body.command_arm(arm, np.array([np.interp(travelled[k], shares, column) for column in pull.postures.T]))
-        if legs is not None:
-            body.command_base(*map(float, way[k]))
+        if pull.back_m > 0.0:
+            body.command_base(*map(float, bases[k]))
             body.command_legs(legs[k])
         yield
     yield from wait(0.1)

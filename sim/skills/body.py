@@ -37,7 +37,7 @@ from sim.skills.gait import leg_motion
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach_map import WOUND_RAD, HandPose, ReachMap, reach_maps
 from sim.skills.runner import CONTROL_DT_S, Skill
-from sim.trajectory import plan
+from sim.trajectory import Trajectory, plan
 from sim.world import World
 
 __all__ = ["ArmGoal", "Body", "BothGoal", "ready_posture", "wait"]
@@ -51,8 +51,9 @@ _WORKTOP_M: Final = 0.97
 HAND_SECONDS: Final = 0.35
 #: Position error of an arm posture that still counts as reaching.
 REACH_TOLERANCE_M: Final = 0.012
-#: How far the ready hand is below the shoulder, as a share of the arm's reach.
-_READY_DROP: Final = 0.17
+#: How far the ready hand is below the shoulder, as a share of the arm's reach: usually, for robots whose hands would then be
+#: lower than worktops, and with a load of such robots.
+_READY_DROP, _LOW_READY_DROP, _LOW_CARRY_DROP = 0.17, 0.05, -0.16
 #: Steps of pelvis height tried when a target is out of reach, metres.
 _HEIGHT_STEP_M: Final = 0.05
 
@@ -126,6 +127,7 @@ class Body:
             arm: np.array([self._actuators[name] for name in self.spec.arms[arm.value].hand_joints]) for arm in Arm
         }
         self._waist_ids = np.array([self._actuators[name] for name in self.spec.waist_joints])
+        self._lag_s = _lags(model)
         self._leg_ids = np.array([self._actuators[name] for name in self.spec.leg_joints])
         self._hand_joints = np.array([int(model.joint(n).id) for arm in Arm for n in self.spec.arms[arm.value].hand_joints])
         sliding = model.jnt_type[self._hand_joints] == int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -206,11 +208,17 @@ class Body:
         """Sets the leg joints' targets (L,)."""
         self.world.data.ctrl[self._leg_ids] = joints
 
-    def walking_legs(self, way: Array) -> Array:
-        """(T, L) leg joints that walk along a way (T, 3) of the base: x, y and yaw."""
+    def walking_targets(self, way: Array) -> tuple[Array, Array]:
+        """Servo targets that take base and feet along a way (T, 3) of x, y and yaw, ahead by what the servos lag behind.
+
+        Returns:
+            (T, 3) base targets and (T, L) leg joints; the last ones are at rest.
+        """
         root = np.array([0.0, 0.0, 0.0, *_quaternion_about_y(self.crouches.pitch(self.pelvis_height_m))])
         soles = self.kinematics.frames(root, self.crouches.posture(self.pelvis_height_m), ("left_sole", "right_sole"))
-        return leg_motion(footsteps(self.kit), self.pelvis_height_m, soles[:, :2, 3], way)
+        legs = leg_motion(footsteps(self.kit), self.pelvis_height_m, soles[:, :2, 3], way)
+        base_ids = np.array([self._base[0], self._base[1], self._base[3]])
+        return _ahead(way, self._lag_s[base_ids]), _ahead(legs, self._lag_s[self._leg_ids])
 
     def pressed_m(self) -> float:
         """How deep the robot presses into anything that it does not hold, metres."""
@@ -457,12 +465,7 @@ class Body:
 
         A load before a hand that is lower than a worktop would run into its front when the robot steps up to it.
         """
-        ready_m = (
-            self.spec.standing_pelvis_height_m
-            + float(self.maps[arm.value].shoulder[2])
-            - _READY_DROP * self.maps[arm.value].reach_m
-        )
-        return ready_posture(self.kit, arm, raised=ready_m < _WORKTOP_M)
+        return ready_posture(self.kit, arm, raised=_low_shoulders(self.kit))
 
     def solve(
         self,
@@ -598,11 +601,16 @@ class Body:
         for goal in waypoints:
             ends = np.stack([self.world.data.ctrl[ids].copy(), goal])
             way = plan(ends, ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed * speed)
-            time_s = 0.0
-            while time_s < way.duration_s:
-                time_s += CONTROL_DT_S
-                self.world.data.ctrl[ids] = way.at(time_s)
-                yield
+            yield from self._follow(way, ids)
+
+    def _follow(self, way: Trajectory, ids: NDArray[np.int64]) -> Skill:
+        """Sends servos along a trajectory, ahead of it by what they lag behind, so that the joints are where it says."""
+        time_s = 0.0
+        while time_s < way.duration_s:
+            time_s += CONTROL_DT_S
+            rate = (way.at(time_s + 0.5 * CONTROL_DT_S) - way.at(time_s - 0.5 * CONTROL_DT_S)) / CONTROL_DT_S
+            self.world.data.ctrl[ids] = way.at(time_s) + (self._lag_s[ids] * rate if time_s < way.duration_s else 0.0)
+            yield
 
     def command_arm(self, arm: Arm, q: Array) -> None:
         """Sets the arm joints' targets."""
@@ -623,11 +631,7 @@ class Body:
             row = np.concatenate([goal.arms[Arm.LEFT], goal.arms[Arm.RIGHT], goal.waist])
             ends = np.stack([self.world.data.ctrl[ids].copy(), row])
             way = plan(ends, ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed**2)
-            time_s = 0.0
-            while time_s < way.duration_s:
-                time_s += CONTROL_DT_S
-                self.world.data.ctrl[ids] = way.at(time_s)
-                yield
+            yield from self._follow(way, ids)
 
     def hand_height(self, goal: BothGoal) -> float:
         """Mean height of both grasp sites in a posture, metres."""
@@ -677,7 +681,7 @@ def ready_posture(kit: RobotKit, arm: Arm, raised: bool = False) -> Array:
     reach_map = reach_maps(kit)[arm.value]
     inward = np.array([0.0, -1.0 if arm is Arm.LEFT else 1.0, 0.0])
     ahead = min(0.3 * reach_map.reach_m, kit.spec.footprint_radius_m - 0.06)  # the disc that navigation keeps free
-    drop = -0.16 if raised else _READY_DROP
+    drop = _LOW_CARRY_DROP if raised else _LOW_READY_DROP if _low_shoulders(kit) else _READY_DROP
     point = np.array([ahead, reach_map.shoulder[1], reach_map.shoulder[2] - drop * reach_map.reach_m])
     wish = HandPose(point, np.array([1.0, 0.0, 0.0]), inward)
     solver = PerArmSolver(kit.model, kit.crouches)
@@ -712,10 +716,33 @@ def ready_posture(kit: RobotKit, arm: Arm, raised: bool = False) -> Array:
     return best[1]
 
 
+def _low_shoulders(kit: RobotKit) -> bool:
+    """Whether hands held as usual would be lower than worktops, and run into their fronts."""
+    reach_map = reach_maps(kit)["left"]
+    return kit.spec.standing_pelvis_height_m + float(reach_map.shoulder[2]) - _READY_DROP * reach_map.reach_m < _WORKTOP_M
+
+
 def wait(seconds: float) -> Skill:
     """Lets physics run."""
     for _ in range(round(seconds / CONTROL_DT_S)):
         yield
+
+
+def _ahead(targets: Array, lag_s: Array) -> Array:
+    """Targets (T, N) of a motion that ends at rest, moved ahead by the servos' lags (N,)."""
+    if len(targets) < 2:
+        return targets
+    rates = np.gradient(targets, CONTROL_DT_S, axis=0)
+    rates[-1] = 0.0
+    return targets + lag_s * rates
+
+
+def _lags(model: mujoco.MjModel) -> Array:
+    """(nu,) seconds that each position servo lags behind a steadily moving target: its damping over its stiffness."""
+    stiffness = np.maximum(model.actuator_gainprm[:, 0], 1e-9)
+    joints = model.actuator_trnid[:, 0]
+    damping = model.dof_damping[model.jnt_dofadr[joints]].reshape(-1) - model.actuator_biasprm[:, 2]
+    return damping / stiffness
 
 
 def _has_actuator(model: mujoco.MjModel, name: str) -> bool:

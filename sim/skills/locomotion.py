@@ -98,12 +98,12 @@ def _travel(body: Body, way: NDArray[np.float64]) -> Skill:
         return
     start = body.commanded_base()
     way = np.concatenate([[(start.x, start.y, start.yaw_rad)], way])  # (T + 1, 3)
-    legs = body.walking_legs(way)
+    bases, legs = body.walking_targets(way)
     press_m, strain = (
         max(limit, now + 0.5 * limit) for limit, now in ((_PRESSED_M, body.pressed_m()), (_STRAIN, body.strain()))
     )
     for tick in range(1, len(way)):
-        body.command_base(*map(float, way[tick]))
+        body.command_base(*map(float, bases[tick]))
         body.command_legs(legs[tick])
         yield
         if body.strain() > strain or body.pressed_m() > press_m:

@@ -543,10 +543,10 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
     steps = max(2, round(1.875 * max(0.5 * turn, 0.1) / _EDGE_SPEED / CONTROL_DT_S))
     ways = np.array([min_jerk(k / steps) for k in range(steps + 1)])
     way = np.column_stack([np.interp(ways, shares, column) for column in stances.T])
-    legs = body.walking_legs(way)
+    bases, legs = body.walking_targets(way)
     for k in range(1, steps + 1):
         body.command_arm(arm, np.array([np.interp(ways[k], shares, column) for column in push.postures.T]))
-        body.command_base(*map(float, way[k]))
+        body.command_base(*map(float, bases[k]))
         body.command_legs(legs[k])
         yield
     yield from wait(0.2)
