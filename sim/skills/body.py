@@ -225,9 +225,9 @@ class Body:
     def interaction_point(self, object_id: str) -> Array:
         """(3,) world point that a robot who goes to an object wants before it: handle, inside, switch or centre."""
         thing = self.thing(object_id)
-        if thing.moving and not thing.is_open and thing.moving[0].handle_site >= 0:
+        if thing.is_shut and thing.moving[0].handle_site >= 0:
             return self.world.data.site_xpos[thing.moving[0].handle_site].copy()
-        if thing.moving:
+        if thing.type.encloses:
             surface = thing.surfaces[0]
             local = np.array([surface.spec.rect[0], surface.spec.rect[1], surface.spec.z]) - surface.origin
             return self.world.data.xpos[surface.body_id] + self.world.data.xmat[surface.body_id].reshape(3, 3) @ local
