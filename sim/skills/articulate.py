@@ -22,6 +22,7 @@ from sim.navigation import Stance
 from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
+from sim.skills.lids import plan_lead, plan_tab
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
 from sim.skills.reach import Reach, explained, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
@@ -62,6 +63,9 @@ class Pull:
     positions: Array
     postures: Array
     back_m: float
+    #: Opening of the hand on arrival, and around the handle.
+    opening: float = 1.0
+    closed: float = 0.35
 
 
 def carried_point(body: Body, part: MovingPart, now: Array, position: float) -> Array:
@@ -102,6 +106,17 @@ def assess_open_close(body: Body, action: Action) -> Pull:
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
     grip_m = body.spec.hand.tip_m - _PAST_BAR_M
 
+    def lid() -> Pull:
+        positions = np.linspace(float(body.world.data.qpos[part.qpos_adr]), goal, _WAYPOINTS)
+        shares = (positions - low) / (high - low)
+        enough = 1 + int(np.argmax(shares > _OPEN_MIN + 0.05 if opening else shares < 0.02))
+        lead = plan_lead(
+            body, arm, lambda q: carried_point(body, part, handle, q), positions, _pointings(body, arm, handle), bar, enough
+        )
+        if lead is None:
+            raise SkillFailure(FailureCode.OBSTRUCTED)
+        return Pull(lead.reach, part, positions[: len(lead.postures)], lead.postures, lead.back_m, lead.opening, lead.closed)
+
     def search() -> Pull:
         best: Pull | None = None
         tried = 0
@@ -120,7 +135,7 @@ def assess_open_close(body: Body, action: Action) -> Pull:
             raise SkillFailure(FailureCode.OBSTRUCTED)
         return best
 
-    return explained(body, {arm: handle}, search)
+    return explained(body, {arm: handle}, lid if part.spec.is_lid else search)
 
 
 def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
@@ -134,6 +149,11 @@ def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
     grip_m = body.spec.hand.tip_m - _PAST_BAR_M
 
     def search() -> Reach:
+        if thing.moving[0].spec.is_lid:
+            reach = plan_tab(body, arm, handle, _pointings(body, arm, handle), bar)
+            if reach is not None:
+                return reach
+            raise SkillFailure(FailureCode.OBSTRUCTED)
         for pointing in _pointings(body, arm, handle):
             reach = plan_reach(body, arm, HandPose(handle - grip_m * pointing, pointing), -pointing, 0.08, bar, pointing=0.7)
             if reach is not None:
@@ -217,10 +237,10 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
     assert arm is not None and action.object_id is not None
     thing, part = body.thing(action.object_id), pull.part
     name = (thing.object_id,)
-    yield from body.move_hand(arm, 1.0, 0.2)
+    yield from body.move_hand(arm, pull.opening, 0.2)
     yield from body.move_arm(arm, [*pull.reach.way, pull.reach.before])
     yield from body.move_arm(arm, [pull.reach.at], speed=0.8)
-    yield from body.move_hand(arm, 0.35, 0.3)
+    yield from body.move_hand(arm, pull.closed, 0.3)
     touched = body.part_geoms(thing, "handle")
     if action.name == "Close":  # a door or drawer can also be pushed shut at its front
         touched = np.flatnonzero(body.world.model.geom_bodyid == part.body_id)
@@ -233,7 +253,8 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
         yield from _leave(body, arm, pull.reach, name)
         code = FailureCode.LOCKED if outcome == "locked" else FailureCode.NOTHING_HAPPENED
         raise SkillFailure(code, contingency=outcome)
-    body.world.attach(arm.value, thing.object_id)
+    lid = part.spec.is_lid  # a lid hangs at its tab, a door at the hand around its bar
+    body.world.attach(arm.value, thing.object_id, part, body.world.handle(thing.object_id) if lid else None)
     yield from _lead(body, arm, pull)
     body.world.detach(arm.value)
     yield from body.move_hand(arm, 1.0, 0.2)

@@ -1,0 +1,176 @@
+"""How a hand leads the tab or knob of a lid: the fingertips follow its arc, so that they stay where the handle is.
+
+A door's bar lies deep in the hand, and the hand turns with it. A lid's tab is small and is held by the fingertips; the lid turns
+about a level axis by more than a right angle, which no wrist follows. So the hand keeps its direction as well as it can, and
+the tab turns between the fingers. Paper: Open and Close of the DualTHOR action space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Arm
+from sim.navigation import Stance
+from sim.skills.body import Body
+from sim.skills.reach import Reach, fulfils, plan_reach
+from sim.skills.reach_map import HandPose
+
+__all__ = ["Lead", "plan_lead", "plan_tab"]
+
+Array = NDArray[np.float64]
+
+_UP: Final = np.array([0.0, 0.0, 1.0])
+#: The fingertips reach this far past the middle of a tab.
+_PAST_M: Final = 0.004
+#: Farthest that the fingertips may be from the tab's arc, and most that a joint turns between two of its points.
+_TOLERANCE_M: Final = 0.015
+_STEP_RAD: Final = 0.9
+_ROUNDS: Final = 3
+#: Ways to a tab that are led to their end before the longest is taken.
+_TRIED: Final = 6
+
+
+@dataclass(frozen=True, slots=True)
+class _Tab:
+    """How a hand takes a tab: where it belongs in the hand (along the fingers and the closing direction), and hand openings."""
+
+    seat: tuple[float, float]
+    opening: float
+    closed: float
+
+    def site(self, tab: Array, pointing: Array, closing: Array) -> Array:
+        """(3,) grasp site of a hand with those directions that has a tab between its fingertips."""
+        return tab - self.seat[0] * pointing - self.seat[1] * closing
+
+
+@dataclass(frozen=True, slots=True)
+class Lead:
+    """A hand's way to a tab and with it.
+
+    Attributes:
+        reach: the motion to the tab.
+        postures: (N, A) arm joints along its arc, from where it is; N is less than asked for where the arm ends.
+        back_m: how far the base steps back on the whole way.
+        opening, closed: opening of the hand on arrival, and when it has the tab.
+    """
+
+    reach: Reach
+    postures: Array
+    back_m: float
+    opening: float
+    closed: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Taking:
+    reach: Reach
+    pointing: Array
+    closing: Array
+    tab: _Tab
+
+
+def _tab(body: Body) -> _Tab:
+    """Five fingers pinch between half-closed fingertips and thumb; parallel fingers close on the tab from both sides."""
+    hand = body.spec.hand
+    if hand.pinch_m is not None:
+        return _Tab((0.04, hand.pinch_m), 0.5, 0.5)
+    return _Tab((hand.tip_m - _PAST_M, 0.0), 1.0, 0.35)
+
+
+def _closings(body: Body, pointing: Array) -> Iterator[Array]:
+    level = np.cross(_UP, pointing)
+    level /= np.linalg.norm(level)
+    down = np.cross(pointing, level)
+    if down[2] > 0.0:
+        down = -down
+    yield from (down, level, -level) if body.spec.hand.pinch_m is not None else (level,)
+
+
+def _takings(body: Body, arm: Arm, tab: Array, pointings: Iterable[Array], bar: Sequence[int]) -> Iterator[_Taking]:
+    """Motions that bring the fingertips to a tab."""
+    how = _tab(body)
+    for pointing in pointings:
+        for closing in _closings(body, pointing):
+            first = body.solve(arm, HandPose(how.site(tab, pointing, closing), pointing, closing))
+            if not fulfils(first, pointing=0.7, closing=0.5):
+                continue
+            # the tab belongs between the fingertips of the hand as it will really be turned
+            x, y = first.pointing, first.closing
+            wish = HandPose(how.site(tab, x, y), x, y)
+            reach = plan_reach(body, arm, wish, -x, 0.07, bar, 0.97, 0.95, opening=how.opening, start=first.q)
+            if reach is not None:
+                yield _Taking(reach, x, y, how)
+                break
+
+
+def plan_tab(body: Body, arm: Arm, tab: Array, pointings: Iterable[Array], bar: Sequence[int]) -> Reach | None:
+    """How the fingertips come to a tab (3,) in the world, None when they do not; `bar` are geoms that may be touched there."""
+    return next((taking.reach for taking in _takings(body, arm, tab, pointings, bar)), None)
+
+
+def plan_lead(
+    body: Body,
+    arm: Arm,
+    arc: Callable[[float], Array],
+    positions: Array,
+    pointings: Iterable[Array],
+    bar: Sequence[int],
+    enough: int,
+) -> Lead | None:
+    """How the fingertips take a tab and lead it along its arc, as far as the arm gets.
+
+    Args:
+        body: the robot.
+        arm: which one.
+        arc: (3,) world point of the tab by the lid's joint position.
+        positions: (N,) joint positions along the way, the present one first.
+        pointings: directions of the fingers to try, the best first.
+        bar: geoms that may be touched on arrival.
+        enough: a way with fewer points is of no use.
+    """
+    base = body.commanded_base()
+    ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
+    free_m = body.navigation().free_travel(base.position, base.position - 0.4 * ahead)
+    best: Lead | None = None
+    for tried, taking in enumerate(_takings(body, arm, arc(float(positions[0])), pointings, bar), 1):
+        for back in (0.0, 0.12, 0.24):
+            if back > free_m:
+                break
+            stances = [
+                Stance(*(base.position - share * back * ahead).tolist(), base.yaw_rad)
+                for share in np.linspace(0.0, 1.0, len(positions))
+            ]
+            postures = _follow(body, arm, [arc(float(p)) for p in positions], stances, taking)
+            if len(postures) >= enough and (best is None or len(postures) > len(best.postures)):
+                made = back * (len(postures) - 1) / (len(positions) - 1)
+                best = Lead(taking.reach, np.stack(postures), made, taking.tab.opening, taking.tab.closed)
+            if len(postures) == len(positions):
+                break
+        if tried >= _TRIED or (best is not None and len(best.postures) == len(positions)):
+            break
+    return best
+
+
+def _follow(body: Body, arm: Arm, points: Sequence[Array], stances: Sequence[Stance], taking: _Taking) -> list[Array]:
+    """(A,) postures whose fingertips are at the points, as many as the arm can do one after the other."""
+    postures, pointing, closing = [taking.reach.at], taking.pointing, taking.closing
+    for point, stance in zip(points[1:], stances[1:], strict=True):
+        start = postures[-1]
+        for _ in range(_ROUNDS):
+            wish = HandPose(taking.tab.site(point, pointing, closing), pointing, closing)
+            goal = body.solve(arm, wish, start=start, base=stance, pointing_weight=0.05, roll_weight=0.02)
+            tip = wish.position - taking.tab.site(point, goal.pointing, goal.closing)
+            pointing, closing, start = goal.pointing, goal.closing, goal.q
+            if goal.error_m + float(np.linalg.norm(tip)) <= _TOLERANCE_M:
+                break
+        else:
+            return postures
+        if float(np.max(np.abs(start - postures[-1]))) > _STEP_RAD:
+            return postures
+        postures.append(start)
+    return postures
