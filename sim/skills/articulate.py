@@ -10,7 +10,7 @@ Paper: Open and Toggle of the DualTHOR action space; Close is ours.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -22,7 +22,7 @@ from sim.navigation import Stance
 from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
-from sim.skills.lids import plan_lead, plan_tab
+from sim.skills.lids import led_on, plan_lead, plan_tab
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
 from sim.skills.reach import Reach, explained, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
@@ -37,6 +37,8 @@ _UP: Final = np.array([0.0, 0.0, 1.0])
 #: The fingertips reach this far past the bar of a handle.
 _PAST_BAR_M: Final = 0.025
 _SPEED: Final = 0.45
+#: A hand that lags behind would tip a light box by its lid.
+_LID_SPEED: Final = 0.3
 #: Share of the joint's range that Open leads the door to, and least share that counts as done.
 _OPEN_TO: Final = 0.95
 _OPEN_MIN: Final = 0.35
@@ -253,8 +255,12 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
         yield from _leave(body, arm, pull.reach, name)
         code = FailureCode.LOCKED if outcome == "locked" else FailureCode.NOTHING_HAPPENED
         raise SkillFailure(code, contingency=outcome)
-    lid = part.spec.is_lid  # a lid hangs at its tab, a door at the hand around its bar
-    body.world.attach(arm.value, thing.object_id, part, body.world.handle(thing.object_id) if lid else None)
+    if part.spec.is_lid:  # a lid hangs at its tab, a door at the hand around its bar
+        tab = body.world.handle(thing.object_id)
+        body.world.attach(arm.value, thing.object_id, part, tab)
+        pull = _aligned(body, arm, pull, tab)
+    else:
+        body.world.attach(arm.value, thing.object_id, part)
     yield from _lead(body, arm, pull)
     body.world.detach(arm.value)
     yield from body.move_hand(arm, 1.0, 0.2)
@@ -265,13 +271,19 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
     yield from stow(body, arm)
 
 
+def _aligned(body: Body, arm: Arm, pull: Pull, tab: Array) -> Pull:
+    """The way of a tab from where it is now between the fingers; the planned one where the arm gets less far from there."""
+    postures = led_on(body, arm, lambda q: carried_point(body, pull.part, tab, q), pull.positions, pull.back_m)
+    return replace(pull, postures=postures) if len(postures) == len(pull.positions) else pull
+
+
 def _lead(body: Body, arm: Arm, pull: Pull) -> Skill:
     """Moves hand and, where planned, base along the planned way."""
     base = body.commanded_base()
     ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
     hinge = abs(float(pull.positions[-1] - pull.positions[0]))
     length = hinge * 0.5 if pull.part.range[1] > 0.6 else hinge
-    duration = 1.875 * max(length, 0.1) / _SPEED
+    duration = 1.875 * max(length, 0.1) / (_LID_SPEED if pull.part.spec.is_lid else _SPEED)
     shares = np.linspace(0.0, 1.0, len(pull.positions))
     steps = max(2, round(duration / CONTROL_DT_S))
     for k in range(1, steps + 1):

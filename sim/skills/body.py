@@ -376,12 +376,20 @@ class Body:
 
     def hand_at(self, arm: Arm, q: Array) -> Array:
         """(3,) world position of the grasp site with an arm posture, from the commanded base."""
+        return self.hand_pose_at(arm, q)[0]
+
+    def hand_pose_at(self, arm: Arm, q: Array, base: Stance | None = None) -> tuple[Array, Array]:
+        """World position (3,) and rotation (3, 3) of the grasp site with an arm posture.
+
+        The base is the commanded one, or another that is turned like it.
+        """
         full = self.kinematics.posture()
         full[self._columns[arm]] = q
         root = np.array([0.0, 0.0, 0.0, *_quaternion_about_y(self.crouches.pitch(self.pelvis_height_m))])
-        base = self.commanded_base()
-        local = self.kinematics.frames(root, full, (self.spec.arms[arm.value].grasp_site,))[0, :3, 3]
-        return self.turn_to_world(local) + (base.x, base.y, self.pelvis_height_m)
+        base = self.commanded_base() if base is None else base
+        frame = self.kinematics.frames(root, full, (self.spec.arms[arm.value].grasp_site,))[0]
+        position = self.turn_to_world(frame[:3, 3]) + (base.x, base.y, self.pelvis_height_m)
+        return position, np.stack([self.turn_to_world(axis) for axis in frame[:3, :3].T], axis=1)
 
     def commanded_arm(self, arm: Arm) -> Array:
         """(A,) commanded arm joints."""

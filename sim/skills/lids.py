@@ -1,8 +1,8 @@
 """How a hand leads the tab or knob of a lid: the fingertips follow its arc, so that they stay where the handle is.
 
-A door's bar lies deep in the hand, and the hand turns with it. A lid's tab is small and is held by the fingertips; the lid turns
-about a level axis by more than a right angle, which no wrist follows. So the hand keeps its direction as well as it can, and
-the tab turns between the fingers. Paper: Open and Close of the DualTHOR action space.
+A door's bar lies deep in the hand, and the hand turns with it. A lid's tab is small and is held by the fingertips; the lid
+turns about a level axis by more than a right angle, which no wrist follows. So the hand keeps its direction as well as it can,
+and the tab turns between the fingers. Paper: Open and Close of the DualTHOR action space.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sim.skills.body import Body
 from sim.skills.reach import Reach, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
 
-__all__ = ["Lead", "plan_lead", "plan_tab"]
+__all__ = ["Lead", "led_on", "plan_lead", "plan_tab"]
 
 Array = NDArray[np.float64]
 
@@ -30,22 +30,20 @@ _PAST_M: Final = 0.004
 #: Farthest that the fingertips may be from the tab's arc, and most that a joint turns between two of its points.
 _TOLERANCE_M: Final = 0.015
 _STEP_RAD: Final = 0.9
-_ROUNDS: Final = 3
+#: A lid that nears the upright turns a small error of the hand's height into a long push: the arc is solved to this distance.
+_EXACT_M: Final = 0.002
+_ROUNDS: Final = 5
 #: Ways to a tab that are led to their end before the longest is taken.
 _TRIED: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
 class _Tab:
-    """How a hand takes a tab: where it belongs in the hand (along the fingers and the closing direction), and hand openings."""
+    """How a hand takes a tab: where it belongs in the grasp site's frame, and the hand's openings before and after."""
 
-    seat: tuple[float, float]
+    seat: tuple[float, float, float]
     opening: float
     closed: float
-
-    def site(self, tab: Array, pointing: Array, closing: Array) -> Array:
-        """(3,) grasp site of a hand with those directions that has a tab between its fingertips."""
-        return tab - self.seat[0] * pointing - self.seat[1] * closing
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +65,16 @@ class Lead:
 
 
 @dataclass(frozen=True, slots=True)
+class _Held:
+    """A tab between the fingers of an arm posture: the hand's directions, and where the tab is in the grasp site's frame."""
+
+    q: Array
+    pointing: Array
+    closing: Array
+    seat: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
 class _Taking:
     reach: Reach
     pointing: Array
@@ -74,12 +82,17 @@ class _Taking:
     tab: _Tab
 
 
+def _site(tab: Array, seat: tuple[float, float, float], pointing: Array, closing: Array) -> Array:
+    """(3,) grasp site of a hand with those directions that has a tab at a seat."""
+    return tab - seat[0] * pointing - seat[1] * closing - seat[2] * np.cross(pointing, closing)
+
+
 def _tab(body: Body) -> _Tab:
     """Five fingers pinch between half-closed fingertips and thumb; parallel fingers close on the tab from both sides."""
     hand = body.spec.hand
     if hand.pinch_m is not None:
-        return _Tab((0.04, hand.pinch_m), 0.5, 0.5)
-    return _Tab((hand.tip_m - _PAST_M, 0.0), 1.0, 0.35)
+        return _Tab((0.04, hand.pinch_m, 0.0), 0.5, 0.5)
+    return _Tab((hand.tip_m - _PAST_M, 0.0, 0.0), 1.0, 0.35)
 
 
 def _closings(body: Body, pointing: Array) -> Iterator[Array]:
@@ -96,12 +109,12 @@ def _takings(body: Body, arm: Arm, tab: Array, pointings: Iterable[Array], bar: 
     how = _tab(body)
     for pointing in pointings:
         for closing in _closings(body, pointing):
-            first = body.solve(arm, HandPose(how.site(tab, pointing, closing), pointing, closing))
+            first = body.solve(arm, HandPose(_site(tab, how.seat, pointing, closing), pointing, closing))
             if not fulfils(first, pointing=0.7, closing=0.5):
                 continue
             # the tab belongs between the fingertips of the hand as it will really be turned
             x, y = first.pointing, first.closing
-            wish = HandPose(how.site(tab, x, y), x, y)
+            wish = HandPose(_site(tab, how.seat, x, y), x, y)
             reach = plan_reach(body, arm, wish, -x, 0.07, bar, 0.97, 0.95, opening=how.opening, start=first.q)
             if reach is not None:
                 yield _Taking(reach, x, y, how)
@@ -141,11 +154,9 @@ def plan_lead(
         for back in (0.0, 0.12, 0.24):
             if back > free_m:
                 break
-            stances = [
-                Stance(*(base.position - share * back * ahead).tolist(), base.yaw_rad)
-                for share in np.linspace(0.0, 1.0, len(positions))
-            ]
-            postures = _follow(body, arm, [arc(float(p)) for p in positions], stances, taking)
+            stances = _stances(body, back, len(positions))
+            way = _Held(taking.reach.at, taking.pointing, taking.closing, taking.tab.seat)
+            postures = _follow(body, arm, [arc(float(p)) for p in positions], stances, way)
             if len(postures) >= enough and (best is None or len(postures) > len(best.postures)):
                 made = back * (len(postures) - 1) / (len(positions) - 1)
                 best = Lead(taking.reach, np.stack(postures), made, taking.tab.opening, taking.tab.closed)
@@ -156,19 +167,52 @@ def plan_lead(
     return best
 
 
-def _follow(body: Body, arm: Arm, points: Sequence[Array], stances: Sequence[Stance], taking: _Taking) -> list[Array]:
+def led_on(body: Body, arm: Arm, arc: Callable[[float], Array], positions: Array, back_m: float) -> Array:
+    """Postures that lead a tab on from where it really is between the fingers, a little beside where it was planned.
+
+    Args:
+        body: the robot.
+        arm: which one.
+        arc: (3,) world point of the tab by the lid's joint position.
+        positions: (N,) joint positions along the way, the present one first.
+        back_m: how far the base steps back on the way.
+
+    Returns:
+        (M, A) arm joints, M at most N: the arm may end before the way does.
+    """
+    tab = arc(float(positions[0]))
+    q = body.commanded_arm(arm)
+    site, hand = body.hand_pose_at(arm, q)
+    x, y, z = hand.T @ (tab - site)
+    points = [arc(float(p)) for p in positions]
+    held = _Held(q, hand[:, 0], hand[:, 1], (float(x), float(y), float(z)))
+    return np.stack(_follow(body, arm, points, _stances(body, back_m, len(positions)), held))
+
+
+def _stances(body: Body, back_m: float, count: int) -> list[Stance]:
+    """The base's ways back, evenly."""
+    base = body.commanded_base()
+    ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
+    places = [base.position - share * back_m * ahead for share in np.linspace(0.0, 1.0, count)]
+    return [Stance(float(x), float(y), base.yaw_rad) for x, y in places]
+
+
+def _follow(body: Body, arm: Arm, points: Sequence[Array], stances: Sequence[Stance], held: _Held) -> list[Array]:
     """(A,) postures whose fingertips are at the points, as many as the arm can do one after the other."""
-    postures, pointing, closing = [taking.reach.at], taking.pointing, taking.closing
+    postures, pointing, closing = [held.q], held.pointing, held.closing
     for point, stance in zip(points[1:], stances[1:], strict=True):
         start = postures[-1]
+        missed, gap_m = np.zeros(3), np.inf
         for _ in range(_ROUNDS):
-            wish = HandPose(taking.tab.site(point, pointing, closing), pointing, closing)
+            wish = HandPose(_site(point, held.seat, pointing, closing) - missed, pointing, closing)
             goal = body.solve(arm, wish, start=start, base=stance, pointing_weight=0.05, roll_weight=0.02)
-            tip = wish.position - taking.tab.site(point, goal.pointing, goal.closing)
-            pointing, closing, start = goal.pointing, goal.closing, goal.q
-            if goal.error_m + float(np.linalg.norm(tip)) <= _TOLERANCE_M:
+            site, hand = body.hand_pose_at(arm, goal.q, stance)
+            off = site + hand @ held.seat - point
+            gap_m, start, pointing, closing = float(np.linalg.norm(off)), goal.q, hand[:, 0], hand[:, 1]
+            if gap_m <= _EXACT_M:
                 break
-        else:
+            missed = missed + off  # the solver is content too early: aim beside the point by what it missed
+        if gap_m > _TOLERANCE_M:
             return postures
         if float(np.max(np.abs(start - postures[-1]))) > _STEP_RAD:
             return postures
