@@ -443,6 +443,10 @@ class World:
             constraints.attach(arm, body, rigid=False, point=point)
         thing.held_by.append(arm)
 
+    def give_way(self, part: MovingPart) -> None:
+        """Lets the hands into a door, drawer or lid that one of them is about to take, so that no contact strains the grasp."""
+        self._constraints().give_way(part.body_id)
+
     def detach(self, arm: str) -> str | None:
         """Lets go of whatever the arm holds and returns its id."""
         name = self.held(arm)
