@@ -20,6 +20,9 @@ from sim.scene import HELD_BITS, HELD_DOOR_BITS, MOVABLE_BITS, STATIC_BITS
 __all__ = ["GraspConstraints"]
 
 _SEPARATION_M = 0.001
+#: Time constants with which a grasp takes up an error of the hand.
+_FIRM_S = 0.01
+_GENTLE_S = 0.036
 
 
 @dataclass(slots=True)
@@ -72,7 +75,14 @@ class GraspConstraints:
         return int(self.model.eq_obj2id[active[0]]) if active else None
 
     def attach(
-        self, arm: str, body: int, *, rigid: bool, lids: Sequence[int] = (), point: NDArray[np.float64] | None = None
+        self,
+        arm: str,
+        body: int,
+        *,
+        rigid: bool,
+        lids: Sequence[int] = (),
+        point: NDArray[np.float64] | None = None,
+        gentle: bool = False,
     ) -> None:
         """Ties a body to a hand in their present relative pose.
 
@@ -82,6 +92,7 @@ class GraspConstraints:
             rigid: weld, else a ball joint (a door turns about its hinge, not with the hand).
             lids: bodies hinged to it that are carried along: they do not touch the hands either.
             point: (3,) where the ball joint is, world frame; the grasp site when None.
+            gentle: whether the fingers give: a lid would drag a light object along else, when the hand errs by millimetres.
         """
         model, data, hand = self.model, self.data, self.hand_bodies[arm]
         eq = self._eq(arm, "weld" if rigid else "ball")
@@ -101,6 +112,7 @@ class GraspConstraints:
             values[0:3] = r1.T @ (point - data.xpos[hand])
             values[3:6] = r2.T @ (point - data.xpos[body])
         model.eq_data[eq] = values
+        model.eq_solref[eq, 0] = _GENTLE_S if gentle else _FIRM_S
         data.eq_active[eq] = 1
         for moved in (body, *lids):
             self._set_bits(moved, HELD_BITS if rigid else HELD_DOOR_BITS)

@@ -62,7 +62,9 @@ _MOVING_DAMPING: Final = {"hinge": 0.6, "slide": 12.0}
 _MOVING_FRICTION: Final = {"hinge": 0.3, "slide": 2.0}
 #: Inertia added to a joint for the solver's sake; a light lid would move like a heavy one with that of a door.
 _MOVING_ARMATURE: Final = 0.02
-_LIGHT_ARMATURE: Final = 0.001
+_LIGHT_ARMATURE: Final = 0.004
+#: Friction of a lid's hinge, nearly hard: MuJoCo's usual one creeps, and an open lid would sink within seconds.
+_LID_SOLIMP: Final = (0.999, 0.9999, 0.001, 0.5, 2.0)
 
 
 class RobotForScene(Protocol):
@@ -290,6 +292,8 @@ def _add_moving(
     joint.damping = [_MOVING_DAMPING[moving.joint] if moving.damping is None else moving.damping, 0.0, 0.0]
     joint.frictionloss = _MOVING_FRICTION[moving.joint] if moving.friction is None else moving.friction
     joint.armature = _MOVING_ARMATURE if moving.mass_kg is None else _LIGHT_ARMATURE
+    if moving.is_lid:
+        joint.solimp_friction = _LID_SOLIMP
     _add_parts(spec, body, f"{name}/", moving.parts, moving.at, catalogue, bits, _moving_mass_kg(moving))
     for part in moving.parts:
         if "handle" in part.options:

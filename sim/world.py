@@ -47,6 +47,8 @@ __all__ = ["World", "WorldError"]
 
 _STEPS_PER_FRAME: Final = round(FRAME_DT_S / TIMESTEP_S)
 _FRAMES_PER_TICK: Final = round(dynamics.TICK_S / FRAME_DT_S)
+#: Objects that are lighter than this are opened with gentle fingers.
+_LIGHT_KG: Final = 1.5
 #: Free distance between objects that the world places by itself: a hand fits between.
 _HAND_GAP_M: Final = 0.09
 
@@ -440,7 +442,7 @@ class World:
             constraints.attach(arm, thing.body_id, rigid=True, lids=thing.body_ids[1:])
         else:
             body = self._nearest_door(arm, thing) if part is None else part.body_id
-            constraints.attach(arm, body, rigid=False, point=point)
+            constraints.attach(arm, body, rigid=False, point=point, gentle=thing.movable and thing.mass_kg < _LIGHT_KG)
         thing.held_by.append(arm)
 
     def give_way(self, part: MovingPart) -> None:
