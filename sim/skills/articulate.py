@@ -267,21 +267,26 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
     body.world.detach(arm.value)
     yield from body.move_hand(arm, 1.0, 0.2)
     position, hand = body.hand_pose(arm)
-    back = -0.08 * hand[:, 0] if not part.spec.is_lid else _off_lid(body, part, body.world.handle(thing.object_id))
-    away = body.solve(arm, HandPose(position + back, hand[:, 0]), start=body.commanded_arm(arm))
-    if away.error_m < 0.03:
-        yield from body.move_arm(arm, [away.q])
-    if part.spec.is_lid:
-        yield from wait(0.1)  # clear of the lid, the hand can touch it again: the way home leads around it
+    ways = _off_lid(body, part, body.world.handle(thing.object_id)) if part.spec.is_lid else (-0.08 * hand[:, 0],)
+    for way in ways:
+        away = body.solve(arm, HandPose(position + way, hand[:, 0]), start=body.commanded_arm(arm))
+        if away.error_m < 0.03:
+            yield from body.move_arm(arm, [away.q])
+            break
+    if part.spec.is_lid:  # home over the lid: an arm that sags on its way would push a light object
+        raised = body.vias(arm)[-1]
+        yield from wait(0.1)  # clear of the lid, the hand can touch it again
+        if body.probe.free(arm, [raised]):
+            yield from body.move_arm(arm, [raised], speed=0.7)
     yield from stow(body, arm)
 
 
-def _off_lid(body: Body, part: MovingPart, tab: Array) -> Array:
-    """(3,) way by which a hand leaves a lid: outwards over its edge, and up."""
+def _off_lid(body: Body, part: MovingPart, tab: Array) -> tuple[Array, ...]:
+    """(3,) ways by which a hand leaves a lid, the longest first: outwards over its edge, and up."""
     anchor, axis = body.world.data.xanchor[part.joint_id], body.world.data.xaxis[part.joint_id]
     out = tab - anchor - float(axis @ (tab - anchor)) * axis
-    way = out / float(np.linalg.norm(out)) + 0.7 * _UP
-    return 0.1 * way / float(np.linalg.norm(way))
+    way = out / float(np.linalg.norm(out)) + 1.2 * _UP
+    return tuple(length * way / float(np.linalg.norm(way)) for length in (0.18, 0.12, 0.07))
 
 
 def _aligned(body: Body, arm: Arm, pull: Pull, tab: Array) -> Pull:

@@ -31,8 +31,11 @@ _PAST_M: Final = 0.004
 _TOLERANCE_M: Final = 0.015
 _STEP_RAD: Final = 0.9
 #: A lid that nears the upright turns a small error of the hand's height into a long push: the arc is solved to this distance.
-_EXACT_M: Final = 0.002
-_ROUNDS: Final = 5
+_EXACT_M: Final = 0.003
+_LOST_M: Final = 0.06
+#: A point of the arc that is farther than this from every sampled hand is not tried.
+_NEAR_M: Final = 0.1
+_ROUNDS: Final = 4
 #: Ways to a tab that are led to their end before the longest is taken.
 _TRIED: Final = 6
 
@@ -146,14 +149,12 @@ def plan_lead(
         bar: geoms that may be touched on arrival.
         enough: a way with fewer points is of no use.
     """
-    base = body.commanded_base()
-    ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
-    free_m = body.navigation().free_travel(base.position, base.position - 0.4 * ahead)
+    backs = _backs(body, arm, arc(float(positions[enough - 1])), (enough - 1) / (len(positions) - 1))
+    if not backs:
+        return None
     best: Lead | None = None
     for tried, taking in enumerate(_takings(body, arm, arc(float(positions[0])), pointings, bar), 1):
-        for back in (0.0, 0.12, 0.24):
-            if back > free_m:
-                break
+        for back in backs:
             stances = _stances(body, back, len(positions))
             way = _Held(taking.reach.at, taking.pointing, taking.closing, taking.tab.seat)
             postures = _follow(body, arm, [arc(float(p)) for p in positions], stances, way)
@@ -189,6 +190,22 @@ def led_on(body: Body, arm: Arm, arc: Callable[[float], Array], positions: Array
     return np.stack(_follow(body, arm, points, _stances(body, back_m, len(positions)), held))
 
 
+def _backs(body: Body, arm: Arm, point: Array, share: float) -> list[float]:
+    """How far the base may step back on the way, so that a point of it at that share can be in reach at all."""
+    base = body.commanded_base()
+    ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
+    free_m = body.navigation().free_travel(base.position, base.position - 0.3 * ahead)
+    found: list[float] = []
+    for back in (0.0, 0.12, 0.24):
+        x, y = base.position - share * back * ahead
+        shoulder = body.shoulder(arm) - share * back * np.append(ahead, 0.0)
+        site = point + _tab(body).seat[0] * (shoulder - point) / float(np.linalg.norm(shoulder - point))
+        stance = Stance(float(x), float(y), base.yaw_rad)
+        if back <= free_m and body.maps[arm.value].gap_m(body.in_trunk(site, None, stance)) <= _NEAR_M:
+            found.append(back)
+    return found
+
+
 def _stances(body: Body, back_m: float, count: int) -> list[Stance]:
     """The base's ways back, evenly."""
     base = body.commanded_base()
@@ -209,7 +226,7 @@ def _follow(body: Body, arm: Arm, points: Sequence[Array], stances: Sequence[Sta
             site, hand = body.hand_pose_at(arm, goal.q, stance)
             off = site + hand @ held.seat - point
             gap_m, start, pointing, closing = float(np.linalg.norm(off)), goal.q, hand[:, 0], hand[:, 1]
-            if gap_m <= _EXACT_M:
+            if gap_m <= _EXACT_M or gap_m > _LOST_M:
                 break
             missed = missed + off  # the solver is content too early: aim beside the point by what it missed
         if gap_m > _TOLERANCE_M:
