@@ -118,9 +118,11 @@ class GraspConstraints:
             self._set_bits(moved, HELD_BITS if rigid else HELD_DOOR_BITS)
         self.released = [pair for pair in self.released if pair[1] not in (body, *lids)]
 
-    def give_way(self, body: int) -> None:
-        """Ends the contacts of a door or lid with the hands, as when it is held."""
-        self._set_bits(body, HELD_DOOR_BITS)
+    def give_way(self, lid: int, below: int | None) -> None:
+        """Ends the contacts of a lid, and of the free body below it, with the hands, as when they are held."""
+        self._set_bits(lid, HELD_DOOR_BITS)
+        if below is not None:
+            self._set_bits(below, HELD_BITS)
 
     def detach(self, arm: str, bodies: Sequence[int], *, last: bool) -> None:
         """Lets go of a body and what is hinged to it; `last` tells that no other hand still holds it."""

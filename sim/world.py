@@ -445,9 +445,13 @@ class World:
             constraints.attach(arm, body, rigid=False, point=point, gentle=thing.movable and thing.mass_kg < _LIGHT_KG)
         thing.held_by.append(arm)
 
-    def give_way(self, part: MovingPart) -> None:
-        """Lets the hands into a door, drawer or lid that one of them is about to take, so that no contact strains the grasp."""
-        self._constraints().give_way(part.body_id)
+    def give_way(self, object_id: str, part: MovingPart) -> None:
+        """Lets the hands into a lid that one of them is about to take, and into a free object below it.
+
+        Fingers around a tab would else press on the object, or hook into its rim and lift it.
+        """
+        thing = self.object(object_id)
+        self._constraints().give_way(part.body_id, thing.body_id if thing.movable else None)
 
     def detach(self, arm: str) -> str | None:
         """Lets go of whatever the arm holds and returns its id."""
@@ -459,7 +463,7 @@ class World:
         constraints = self._constraints()
         body = constraints.held_body(arm)
         if body is not None:
-            constraints.detach(arm, thing.body_ids if body == thing.body_id else (body,), last=not thing.held_by)
+            constraints.detach(arm, thing.body_ids if thing.movable else (body,), last=not thing.held_by)
         return name
 
     def held(self, arm: str) -> str | None:

@@ -256,7 +256,7 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
         code = FailureCode.LOCKED if outcome == "locked" else FailureCode.NOTHING_HAPPENED
         raise SkillFailure(code, contingency=outcome)
     if part.spec.is_lid:  # a lid hangs at its tab, a door at the hand around its bar
-        body.world.give_way(part)  # a hand that presses on a light object would tip it
+        body.world.give_way(thing.object_id, part)
         yield from wait(0.2)
         tab = body.world.handle(thing.object_id)
         body.world.attach(arm.value, thing.object_id, part, tab)
