@@ -225,6 +225,8 @@ class Body:
     def interaction_point(self, object_id: str) -> Array:
         """(3,) world point that a robot who goes to an object wants before it: handle, inside, switch or centre."""
         thing = self.thing(object_id)
+        if thing.movable and thing.type.lidded:  # to lift it as well as to open it
+            return self.world_position(object_id)
         if thing.is_shut and thing.moving[0].handle_site >= 0:
             return self.world.data.site_xpos[thing.moving[0].handle_site].copy()
         if thing.type.encloses:
