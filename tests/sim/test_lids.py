@@ -182,6 +182,12 @@ def test_a_lifted_box_and_laptop_keep_their_lids_shut(session):
     assert session.world.object("Laptop_1").openness < 0.05
 
 
+def test_an_open_book_is_picked_up_by_its_pages(session):
+    start(session, "bedroom_1", ObjectPlacement("Book_1", "Desk_1", (-0.22, -2.3), yaw_deg=180.0, state={"isOpen": True}))
+    assert reach(session, "Pick(right, Book_1)").success
+    assert session.world.parents("Book_1") == () and session.world.object("Book_1").is_open
+
+
 def test_a_toilet_lid_shuts_nothing_away(session):
     start(session, "bathroom_1", ObjectPlacement("ToiletPaper_1", "Toilet_1"))
     refusal = session.assess(PlanStep.parse("Pick(right, ToiletPaper_1)").actions[0])
