@@ -63,8 +63,8 @@ _MOVING_FRICTION: Final = {"hinge": 0.3, "slide": 2.0}
 #: Inertia added to a joint for the solver's sake; a light lid would move like a heavy one with that of a door.
 _MOVING_ARMATURE: Final = 0.02
 _LIGHT_ARMATURE: Final = 0.004
-#: Friction of a lid's hinge, nearly hard: MuJoCo's usual one creeps, and an open lid would sink within seconds.
-_LID_SOLIMP: Final = (0.999, 0.9999, 0.001, 0.5, 2.0)
+#: Friction of a lid's hinge, harder than usual, which creeps; much harder, and the solver does not converge and the lid sinks.
+_LID_SOLIMP: Final = (0.97, 0.98, 0.001, 0.5, 2.0)
 
 
 class RobotForScene(Protocol):

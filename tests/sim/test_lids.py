@@ -131,6 +131,16 @@ def test_a_half_open_lid_is_restored_to_the_bit(world):
     world.restore(snapshot)
 
 
+def test_lids_stay_where_they_are_in_a_room_with_a_robot_that_moves(world):
+    names = ("Box_1", "Box_2", "Laptop_1", "Book_1", "LaundryHamper_1")
+    snapshot, before = world.save(), [world.object(name).openness for name in names]
+    for k in range(50):
+        world.set_hand("left", 0.5 + 0.5 * float(np.sin(k)))
+        world.advance(0.1)
+    assert [world.object(name).openness for name in names] == pytest.approx(before, abs=0.03)
+    world.restore(snapshot)
+
+
 def test_a_load_does_not_weigh_on_the_lid(world):
     box = world.object("Box_1")
     before = world.model.body_mass[list(box.body_ids)].copy()
