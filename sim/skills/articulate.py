@@ -282,10 +282,11 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
 
 
 def _off_lid(body: Body, part: MovingPart, tab: Array) -> tuple[Array, ...]:
-    """(3,) ways by which a hand leaves a lid, the longest first: outwards over its edge, and up."""
+    """(3,) ways by which a hand leaves a lid, the longest first: up, and outwards over its edge when it is open."""
     anchor, axis = body.world.data.xanchor[part.joint_id], body.world.data.xaxis[part.joint_id]
     out = tab - anchor - float(axis @ (tab - anchor)) * axis
-    way = out / float(np.linalg.norm(out)) + 1.2 * _UP
+    out /= float(np.linalg.norm(out))
+    way = max(float(out[2]), 0.0) * out + 1.2 * _UP  # a thumb behind the rim of a closed box would draw it along: straight up
     return tuple(length * way / float(np.linalg.norm(way)) for length in (0.18, 0.12, 0.07))
 
 

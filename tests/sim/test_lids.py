@@ -67,7 +67,7 @@ def test_a_lid_stays_where_it_is_left(name, openness):
     part = thing.moving[0]
     before = data.qpos[part.qpos_adr]
     mujoco.mj_step(model, data, round(5.0 / model.opt.timestep))
-    assert data.qpos[part.qpos_adr] == pytest.approx(before, abs=0.06)
+    assert data.qpos[part.qpos_adr] == pytest.approx(before, abs=0.08)
     assert data.xmat[thing.body_id].reshape(3, 3)[2, 2] > 0.999  # an open one does not tip its object over
 
 
