@@ -8,6 +8,7 @@ DualTHOR, which need no contact there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import mujoco
@@ -19,6 +20,9 @@ from sim.scene import HELD_BITS, HELD_DOOR_BITS, MOVABLE_BITS, STATIC_BITS
 __all__ = ["GraspConstraints"]
 
 _SEPARATION_M = 0.001
+#: Time constants with which a grasp takes up an error of the hand.
+_FIRM_S = 0.01
+_GENTLE_S = 0.036
 
 
 @dataclass(slots=True)
@@ -65,14 +69,30 @@ class GraspConstraints:
     def _eq(self, arm: str, kind: str) -> int:
         return int(self.model.equality(f"{arm}_{kind}").id)
 
-    def attach(self, arm: str, body: int, *, rigid: bool, movable: bool) -> None:
+    def held_body(self, arm: str) -> int | None:
+        """The body that an arm holds, and None when it holds none."""
+        active = [eq for eq in (self._eq(arm, "weld"), self._eq(arm, "ball")) if self.data.eq_active[eq]]
+        return int(self.model.eq_obj2id[active[0]]) if active else None
+
+    def attach(
+        self,
+        arm: str,
+        body: int,
+        *,
+        rigid: bool,
+        lids: Sequence[int] = (),
+        point: NDArray[np.float64] | None = None,
+        gentle: bool = False,
+    ) -> None:
         """Ties a body to a hand in their present relative pose.
 
         Args:
             arm: left or right.
             body: MuJoCo body id.
-            rigid: weld, else a ball joint at the grasp site (a door turns about its hinge, not with the hand).
-            movable: whether the body is a free object, for its collision bits.
+            rigid: weld, else a ball joint (a door turns about its hinge, not with the hand).
+            lids: bodies hinged to it that are carried along: they do not touch the hands either.
+            point: (3,) where the ball joint is, world frame; the grasp site when None.
+            gentle: whether the fingers give: a lid would drag a light object along else, when the hand errs by millimetres.
         """
         model, data, hand = self.model, self.data, self.hand_bodies[arm]
         eq = self._eq(arm, "weld" if rigid else "ball")
@@ -87,20 +107,29 @@ class GraspConstraints:
             values[6:10] = relative
             values[10] = 1.0
         else:
-            point = data.site_xpos[self.grasp_sites[arm]]
+            if point is None:
+                point = data.site_xpos[self.grasp_sites[arm]]
             values[0:3] = r1.T @ (point - data.xpos[hand])
             values[3:6] = r2.T @ (point - data.xpos[body])
         model.eq_data[eq] = values
+        model.eq_solref[eq, 0] = _GENTLE_S if gentle else _FIRM_S
         data.eq_active[eq] = 1
-        self._set_bits(body, HELD_BITS if movable else HELD_DOOR_BITS)
-        self.released = [pair for pair in self.released if pair[1] != body]
+        for moved in (body, *lids):
+            self._set_bits(moved, HELD_BITS if rigid else HELD_DOOR_BITS)
+        self.released = [pair for pair in self.released if pair[1] not in (body, *lids)]
 
-    def detach(self, arm: str, body: int, *, last: bool) -> None:
-        """Lets go of a body; `last` tells that no other hand still holds it."""
+    def give_way(self, lid: int, below: int | None) -> None:
+        """Ends the contacts of a lid, and of the free body below it, with the hands, as when they are held."""
+        self._set_bits(lid, HELD_DOOR_BITS)
+        if below is not None:
+            self._set_bits(below, HELD_BITS)
+
+    def detach(self, arm: str, bodies: Sequence[int], *, last: bool) -> None:
+        """Lets go of a body and what is hinged to it; `last` tells that no other hand still holds it."""
         for kind in ("weld", "ball"):
             self.data.eq_active[self._eq(arm, kind)] = 0
         if last:
-            self.released.append((arm, body))
+            self.released += [(arm, body) for body in bodies]
 
     def settle_released(self, movable: dict[int, bool]) -> None:
         """Gives released bodies their contact with the hands back once they are clear of both hands."""

@@ -145,7 +145,8 @@ class Expert:
             name for name, thing in session.world.objects.items() if thing.movable and session.world.needs_two_hands(name)
         )
         held = {arm: None if item == lifted else item for arm, item in session.body.held.items()}
-        return Facts(objects, held, lifted, two_handed, self._homes)
+        uncovered = frozenset(name for name, thing in session.world.objects.items() if not thing.type.encloses)
+        return Facts(objects, held, lifted, two_handed, self._homes, uncovered)
 
     def step(self, observation: object = None, feedback: object = None) -> PlanStep:
         """The planner interface; what it is shown does not matter to it."""
@@ -302,7 +303,7 @@ class Expert:
         world, body = self._session.world, self._session.body
         load = body.lifted or (None if job.arm is None else body.held[job.arm])
         thing = world.objects[job.target]
-        if not job.verb.startswith("Place") or load is None or thing.moving:
+        if not job.verb.startswith("Place") or load is None or (thing.type.encloses and not thing.type.lidded):
             return 0.0
         spot = world.free_spot(job.target, 0.03)
         if spot is None:

@@ -1,7 +1,7 @@
 """Pictures of rooms, object types and robots, for the eye: `python -m sim.look [folder]`.
 
-Writes each room from above and through the robot's head camera, a contact sheet of the types, and each robot standing,
-crouching and holding a plant with both hands. Not part of any experiment.
+Writes each room from above and through the robot's head camera, a contact sheet of the types, their lids, and each robot
+standing, crouching and holding a plant with both hands. Not part of any experiment.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from sim.session import Session
 from sim.tasks.task import load_benchmark
 from sim.world import World
 
-__all__ = ["contact_sheet", "main", "robot_poses", "room_pictures", "room_sheet"]
+__all__ = ["contact_sheet", "lid_sheet", "main", "robot_poses", "room_pictures", "room_sheet"]
 
 
 def room_pictures(folder: Path, robot: str = "h1") -> list[Path]:
@@ -94,9 +94,20 @@ def _portrait(session: Session, size: int) -> NDArray[np.uint8]:
         return renderer.render().copy()
 
 
-def _tile(type_name: str, size: int) -> NDArray[np.uint8]:
+def lid_sheet(size: int = 224) -> NDArray[np.uint8]:
+    """(rows * size, 3 * size, 3) every type with a lid: closed, half open and open."""
+    names = [name for name, kind in load_catalogue().types.items() if kind.lidded]
+    return np.concatenate([np.concatenate([_tile(name, size, share) for share in (0.0, 0.5, 1.0)], axis=1) for name in names])
+
+
+def _tile(type_name: str, size: int, openness: float | None = None) -> NDArray[np.uint8]:
+    """A type alone, its doors and lids as at the start or open by that share."""
     model = build_type_spec(type_name).compile()
     data = mujoco.MjData(model)
+    for moving in load_catalogue().get(type_name).moving:
+        share = moving.start if openness is None else openness
+        joint = model.joint(f"{type_name}_1/{moving.name}")
+        data.qpos[joint.qposadr[0]] = moving.range[0] + share * (moving.range[1] - moving.range[0])
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, size, size) as renderer:
         renderer.update_scene(data, camera="view")
@@ -108,8 +119,9 @@ def main(folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     sheet = folder / "types.png"
     iio.imwrite(sheet, contact_sheet())
+    iio.imwrite(folder / "lids.png", lid_sheet())
     iio.imwrite(folder / "rooms.png", room_sheet())
-    written = [sheet, folder / "rooms.png", *room_pictures(folder)]
+    written = [sheet, folder / "lids.png", folder / "rooms.png", *room_pictures(folder)]
     for robot in ("h1", "x1"):
         written.append(folder / f"{robot}_poses.png")
         iio.imwrite(written[-1], robot_poses(robot))

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.catalogue import Catalogue, ObjectType, SurfaceSpec
+from sim.catalogue import Catalogue, MovingSpec, ObjectType, SurfaceSpec
 
 __all__ = [
     "STATE_NAMES",
@@ -93,13 +93,14 @@ STATE_NAMES: Final = tuple(f.name for f in fields(ObjectState))
 
 @dataclass(frozen=True, slots=True)
 class MovingPart:
-    """A door or drawer in the model.
+    """A door, drawer or lid in the model.
 
     Attributes:
         name: name in the catalogue.
         body_id, joint_id, qpos_adr, dof_adr: MuJoCo indices.
         range: closed and open joint position.
         handle_site: MuJoCo site id of the handle, -1 without one.
+        spec: its entry of the catalogue.
     """
 
     name: str
@@ -109,6 +110,7 @@ class MovingPart:
     dof_adr: int
     range: tuple[float, float]
     handle_site: int
+    spec: MovingSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,10 +131,10 @@ class ObjectInstance:
         type: its catalogue type.
         movable: whether it has a free joint in this scene.
         body_id: MuJoCo body.
-        body_ids: the body and its doors and drawers.
+        body_ids: the body and its doors, drawers and lids.
         geom_ids: all geoms.
         qpos_adr, dof_adr: of the free joint, -1 for furniture.
-        moving: doors and drawers.
+        moving: doors, drawers and lids.
         surfaces: where things can rest.
         toggle_site: MuJoCo site a finger touches to switch it, -1 without one.
         local_min, local_max: bounding box of the resting shape in the body frame, metres.
@@ -161,8 +163,13 @@ class ObjectInstance:
 
     @property
     def is_open(self) -> bool:
-        """Whether its door or drawer is more than a third open; True for what cannot be closed."""
+        """Whether its door, drawer or lid is more than a third open; True for what cannot be closed."""
         return self.openness > 1.0 / 3.0 if self.moving else True
+
+    @property
+    def is_shut(self) -> bool:
+        """Whether what it carries is out of reach, because it is closed."""
+        return self.type.encloses and not self.is_open
 
     @property
     def is_broken(self) -> bool:
@@ -198,7 +205,8 @@ def index_object(model: mujoco.MjModel, object_id: str, catalogue: Catalogue) ->
         j = model.joint(name)
         door = int(model.body(name).id)
         site = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_SITE), f"{name}/handle")
-        parts.append(MovingPart(moving.name, door, int(j.id), int(j.qposadr[0]), int(j.dofadr[0]), moving.range, site))
+        address, dof = int(j.qposadr[0]), int(j.dofadr[0])
+        parts.append(MovingPart(moving.name, door, int(j.id), address, dof, moving.range, site, moving))
         surfaces += [Surface(spec, door, np.asarray(moving.at, dtype=float)) for spec in moving.surfaces]
     bodies = (body, *(part.body_id for part in parts))
     geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies))

@@ -172,7 +172,8 @@ def resting_on(data: mujoco.MjData, objects: Mapping[str, ObjectInstance]) -> di
             margin = 0.02 if _is_hollow(receptacle) else 0.05
             if abs(x - cx) > sx / 2.0 + margin or abs(y - cy) > sy / 2.0 + margin:
                 continue
-            reach = 0.6 * surface.spec.clearance if _is_hollow(receptacle) and not surface.spec.inside else 0.03
+            heap = _is_hollow(receptacle) and (receptacle.type.lidded or not surface.spec.inside)
+            reach = 0.6 * surface.spec.clearance if heap else 0.03
             if thing.held_by:
                 reach = 0.006
             level = float(data.xpos[surface.body_id, 2] - surface.origin[2] + surface.spec.z)

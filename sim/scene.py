@@ -59,7 +59,15 @@ _ARENA_BYTES: Final = 8 << 20
 _WALLS: Final = ("north", "east", "south", "west")
 _CEILING: Final = (0.97, 0.97, 0.95)
 _OBJECT_FRICTION: Final = (1.0, 0.01, 0.001)
+#: Doors and drawers of which the catalogue says nothing else.
 _MOVING_MASS_KG: Final = {"hinge": 2.5, "slide": 1.5}
+_MOVING_DAMPING: Final = {"hinge": 0.6, "slide": 12.0}
+_MOVING_FRICTION: Final = {"hinge": 0.3, "slide": 2.0}
+#: Inertia added to a joint for the solver's sake; a light lid would move like a heavy one with that of a door.
+_MOVING_ARMATURE: Final = 0.02
+_LIGHT_ARMATURE: Final = 0.004
+#: Friction of a lid's hinge, harder than usual, which creeps; much harder, and the solver does not converge and the lid sinks.
+_LID_SOLIMP: Final = (0.97, 0.98, 0.001, 0.5, 2.0)
 
 
 class RobotForScene(Protocol):
@@ -271,10 +279,14 @@ def _add_object(
     spec: mujoco.MjSpec, body: mujoco.MjsBody, object_id: str, kind: ObjectType, catalogue: Catalogue, *, movable: bool
 ) -> None:
     bits = MOVABLE_BITS if movable else STATIC_BITS
-    moving_mass = sum(_MOVING_MASS_KG[moving.joint] for moving in kind.moving) if movable else 0.0
+    moving_mass = sum(_moving_mass_kg(moving) for moving in kind.moving) if movable else 0.0
     _add_parts(spec, body, f"{object_id}/", kind.parts, (0.0, 0.0, 0.0), catalogue, bits, (kind.mass or 1.0) - moving_mass)
     for moving in kind.moving:
         _add_moving(spec, body, object_id, moving, catalogue, bits)
+
+
+def _moving_mass_kg(moving: MovingSpec) -> float:
+    return _MOVING_MASS_KG[moving.joint] if moving.mass_kg is None else moving.mass_kg
 
 
 def _add_moving(
@@ -285,10 +297,12 @@ def _add_moving(
     hinge = moving.joint == "hinge"
     kind = mujoco.mjtJoint.mjJNT_HINGE if hinge else mujoco.mjtJoint.mjJNT_SLIDE
     joint = body.add_joint(name=name, type=int(kind), axis=list(moving.axis), range=list(moving.range), limited=True)
-    joint.damping = [0.6, 0.0, 0.0] if hinge else [12.0, 0.0, 0.0]
-    joint.frictionloss = 0.3 if hinge else 2.0
-    joint.armature = 0.02
-    _add_parts(spec, body, f"{name}/", moving.parts, moving.at, catalogue, bits, _MOVING_MASS_KG[moving.joint])
+    joint.damping = [_MOVING_DAMPING[moving.joint] if moving.damping is None else moving.damping, 0.0, 0.0]
+    joint.frictionloss = _MOVING_FRICTION[moving.joint] if moving.friction is None else moving.friction
+    joint.armature = _MOVING_ARMATURE if moving.mass_kg is None else _LIGHT_ARMATURE
+    if moving.is_lid:
+        joint.solimp_friction = _LID_SOLIMP
+    _add_parts(spec, body, f"{name}/", moving.parts, moving.at, catalogue, bits, _moving_mass_kg(moving))
     for part in moving.parts:
         if "handle" in part.options:
             body.add_site(name=f"{name}/handle", pos=list(np.subtract(part.center, moving.at)), size=[0.005] * 3, group=4)

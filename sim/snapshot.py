@@ -22,6 +22,7 @@ MODEL_FIELDS: Final = (
     "eq_obj1id",
     "eq_obj2id",
     "eq_data",
+    "eq_solref",
     "geom_contype",
     "geom_conaffinity",
     "geom_pos",

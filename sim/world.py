@@ -24,7 +24,16 @@ from sim import dynamics, liquids
 from sim.catalogue import Catalogue, Part, load_catalogue
 from sim.constraints import GraspConstraints
 from sim.metadata import world_metadata
-from sim.objects import STATE_NAMES, ObjectInstance, ObjectPlacement, ObjectState, Placement, copy_state, index_object
+from sim.objects import (
+    STATE_NAMES,
+    MovingPart,
+    ObjectInstance,
+    ObjectPlacement,
+    ObjectState,
+    Placement,
+    copy_state,
+    index_object,
+)
 from sim.placement import OVERHANG_SHARE, REACH_BAND_M, box_in_world, find_free_spot, resting_on
 from sim.recorder import FRAME_DT_S, MotionWindow, Recorder
 from sim.rendering import Renderer, View
@@ -38,6 +47,8 @@ __all__ = ["World", "WorldError"]
 
 _STEPS_PER_FRAME: Final = round(FRAME_DT_S / TIMESTEP_S)
 _FRAMES_PER_TICK: Final = round(dynamics.TICK_S / FRAME_DT_S)
+#: Objects that are lighter than this are opened with gentle fingers.
+_LIGHT_KG: Final = 1.5
 #: Free distance between objects that the world places by itself: a hand fits between.
 _HAND_GAP_M: Final = 0.09
 
@@ -90,7 +101,7 @@ class World:
         self.catalogue = load_catalogue()
         self.rng = np.random.default_rng(seed)
         if placements is None:
-            placements = [ObjectPlacement(item.id, item.receptacle) for item in self.room.objects]
+            placements = [ObjectPlacement(item.id, item.receptacle, yaw_deg=item.yaw_deg) for item in self.room.objects]
         ids = [placement.object_id for placement in placements]
         fixed = [item.id for item in self.room.furniture]
         repeated = sorted({name for name in ids if ids.count(name) > 1} | (set(ids) & set(fixed)))
@@ -120,6 +131,9 @@ class World:
         self._renderers: dict[tuple[int, int], Renderer] = {}
         if robot is not None:
             self._reset_robot(robot, start, pelvis_height_m, joint_positions or {})
+        for thing in self.objects.values():
+            if thing.type.starts_open > 0.0:
+                self._start_state(thing, {"openness": thing.type.starts_open})
         for name, values in (states or {}).items():
             self._start_state(self.object(name), values)
         for placement in placements:
@@ -217,7 +231,7 @@ class World:
         for name, value in values.items():
             if name in ("isOpen", "openness"):
                 if not thing.moving:
-                    raise WorldError(f"{thing.object_id} has no door or drawer, {name}={value!r} is not possible")
+                    raise WorldError(f"{thing.object_id} has no door, drawer or lid, {name}={value!r} is not possible")
                 for part in thing.moving:
                     self.data.qpos[part.qpos_adr] = part.range[0] + float(value) * (part.range[1] - part.range[0])
                 thing.openness = float(value)
@@ -403,10 +417,18 @@ class World:
 
     # ---- grasps -------------------------------------------------------------------------------------------------------------
 
-    def attach(self, arm: str, object_id: str) -> None:
-        """Ties an object to a hand as it is now: free objects rigidly, doors and drawers by a ball joint at the grasp site.
+    def attach(
+        self, arm: str, object_id: str, part: MovingPart | None = None, point: NDArray[np.float64] | None = None
+    ) -> None:
+        """Ties an object to a hand as it is now: free objects rigidly, doors, drawers and lids by a ball joint.
 
         Whether contact justifies it is the caller's decision.
+
+        Args:
+            arm: left or right.
+            object_id: the object.
+            part: its door, drawer or lid that is taken; None takes a free object as a whole, and the nearest door of furniture.
+            point: (3,) where the ball joint is, world frame; the grasp site when None.
 
         Raises:
             WorldError: when the arm holds something, or the object is furniture without a door.
@@ -416,9 +438,20 @@ class World:
             raise WorldError(f"the {arm} arm already holds {self.held(arm)}")
         if not thing.movable and not thing.moving:
             raise WorldError(f"{object_id} is furniture and cannot be held")
-        body = thing.body_id if thing.movable else self._nearest_door(arm, thing)
-        constraints.attach(arm, body, rigid=thing.movable, movable=thing.movable)
+        if thing.movable and part is None:
+            constraints.attach(arm, thing.body_id, rigid=True, lids=thing.body_ids[1:])
+        else:
+            body = self._nearest_door(arm, thing) if part is None else part.body_id
+            constraints.attach(arm, body, rigid=False, point=point, gentle=thing.movable and thing.mass_kg < _LIGHT_KG)
         thing.held_by.append(arm)
+
+    def give_way(self, object_id: str, part: MovingPart) -> None:
+        """Lets the hands into a lid that one of them is about to take, and into a free object below it.
+
+        Fingers around a tab would else press on the object, or hook into its rim and lift it.
+        """
+        thing = self.object(object_id)
+        self._constraints().give_way(part.body_id, thing.body_id if thing.movable else None)
 
     def detach(self, arm: str) -> str | None:
         """Lets go of whatever the arm holds and returns its id."""
@@ -428,9 +461,9 @@ class World:
         thing = self.objects[name]
         thing.held_by.remove(arm)
         constraints = self._constraints()
-        for body in thing.body_ids:
-            if body == int(self.model.eq_obj2id[int(self.model.equality(f"{arm}_{'weld' if thing.movable else 'ball'}").id)]):
-                constraints.detach(arm, body, last=not thing.held_by)
+        body = constraints.held_body(arm)
+        if body is not None:
+            constraints.detach(arm, thing.body_ids if thing.movable else (body,), last=not thing.held_by)
         return name
 
     def held(self, arm: str) -> str | None:
@@ -677,12 +710,15 @@ class World:
     def _update_mass(self, thing: ObjectInstance) -> None:
         if not thing.movable:
             return
-        bodies = list(thing.body_ids)
-        base = float(self._base_mass[bodies].sum())
-        factor = (thing.mass_kg + self.liquid_kg(thing.object_id)) / base
-        self.model.body_mass[bodies] = self._base_mass[bodies] * factor
-        self.model.body_inertia[bodies] = self._base_inertia[bodies] * factor
-        self.model.body_subtreemass[thing.body_id] = base * factor
+        body, lids = thing.body_id, list(thing.body_ids[1:])
+        total, moving = thing.mass_kg + self.liquid_kg(thing.object_id), float(self._base_mass[lids].sum())
+        # what it holds weighs on the object itself: its door or lid stays as heavy as it is, unless all is lighter than that
+        share = min(1.0, 0.5 * total / moving) if moving > 0.0 else 1.0
+        factor = (total - share * moving) / float(self._base_mass[body])
+        for index, by in ((body, factor), *((lid, share) for lid in lids)):
+            self.model.body_mass[index] = self._base_mass[index] * by
+            self.model.body_inertia[index] = self._base_inertia[index] * by
+        self.model.body_subtreemass[body] = total
 
     def metadata(self) -> dict[str, Any]:
         """AI2-THOR-style state of the scene, see `sim.metadata`."""

@@ -134,7 +134,7 @@ class SurfaceSpec:
 
 @dataclass(frozen=True, slots=True)
 class MovingSpec:
-    """A door or drawer: a hinged or sliding body.
+    """A door, drawer or lid: a hinged or sliding body.
 
     Attributes:
         name: unique within the type.
@@ -144,6 +144,9 @@ class MovingSpec:
         range: closed and fully open position, radians or metres.
         parts: primitives, in the frame of the type at the closed position.
         surfaces: surfaces that travel with it.
+        mass_kg: its mass, a share of the object's where that can be lifted; None for that of a door or drawer.
+        friction, damping: of the joint, N m and N m s (N and N s/m of a slide); None for those of a door or drawer.
+        start: share of the range by which it is open at the start.
     """
 
     name: str
@@ -153,6 +156,23 @@ class MovingSpec:
     range: tuple[float, float]
     parts: tuple[Part, ...]
     surfaces: tuple[SurfaceSpec, ...] = ()
+    mass_kg: float | None = None
+    friction: float | None = None
+    damping: float | None = None
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.start <= 1.0:
+            raise ValueError(f"{self.name}: start must be in [0, 1], got {self.start!r}")
+        for name in ("mass_kg", "friction", "damping"):
+            value = getattr(self, name)
+            if value is not None and value <= 0.0:
+                raise ValueError(f"{self.name}: {name} must be positive, got {value!r}")
+
+    @property
+    def is_lid(self) -> bool:
+        """Whether it turns about a level axis: a lid, a cover, a screen."""
+        return self.joint == "hinge" and abs(self.axis[2]) < 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +186,7 @@ class ObjectType:
         mass: kilograms, None for fixtures.
         properties: subset of `PROPERTIES`.
         parts: primitives of the fixed body.
-        moving: doors and drawers.
+        moving: doors, drawers and lids.
         surfaces: where objects can rest.
         grips: `single` and `double` to preferred hand points in the type's frame, metres.
         capacity_l: litres of liquid that it holds; None for what the size suggests (`sim.liquids`).
@@ -220,8 +240,24 @@ class ObjectType:
 
     @property
     def openable(self) -> bool:
-        """Whether it has a door or drawer that moves; openable types without one (books, boxes) are modelled as they lie."""
+        """Whether it has a door, drawer or lid."""
         return bool(self.moving)
+
+    @property
+    def encloses(self) -> bool:
+        """Whether all that it carries is shut away when it is closed; a toilet's lid shuts nothing away from its tank."""
+        surfaces = [*self.surfaces, *(surface for moving in self.moving for surface in moving.surfaces)]
+        return bool(self.moving) and bool(surfaces) and all(surface.inside for surface in surfaces)
+
+    @property
+    def starts_open(self) -> float:
+        """How far it is open at the start, 0 to 1, when nothing else is said."""
+        return max((moving.start for moving in self.moving), default=0.0)
+
+    @property
+    def lidded(self) -> bool:
+        """Whether it opens at the top."""
+        return any(moving.is_lid for moving in self.moving)
 
     @property
     def toggleable(self) -> bool:

@@ -49,10 +49,17 @@ class Furniture:
 
 @dataclass(frozen=True, slots=True)
 class DefaultObject:
-    """A movable object that lies in the room when no task says otherwise."""
+    """A movable object that lies in the room when no task says otherwise.
+
+    Attributes:
+        id: `Type_n`.
+        receptacle: id of the furniture that carries it.
+        yaw_deg: orientation about z; at 0 its front looks along -y.
+    """
 
     id: str
     receptacle: str
+    yaw_deg: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ Paper: Open and Toggle of the DualTHOR action space; Close is ours.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import mujoco
@@ -24,6 +24,7 @@ from sim.navigation import Stance
 from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
+from sim.skills.lids import led_on, plan_lead, plan_tab
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
 from sim.skills.push import Push, plan_push, push_shut
 from sim.skills.reach import Reach, explained, fulfils, plan_reach
@@ -39,6 +40,8 @@ _UP: Final = np.array([0.0, 0.0, 1.0])
 #: The fingertips reach this far past the bar of a handle.
 _PAST_BAR_M: Final = 0.025
 _SPEED: Final = 0.45
+#: A hand that lags behind would tip a light box by its lid.
+_LID_SPEED: Final = 0.3
 #: Share of the joint's range that Open leads the door to, and least share that counts as done.
 _OPEN_TO: Final = 0.95
 _OPEN_MIN: Final = 0.35
@@ -65,6 +68,9 @@ class Pull:
     positions: Array
     postures: Array
     back_m: float
+    #: Opening of the hand on arrival, and around the handle.
+    opening: float = 1.0
+    closed: float = 0.35
 
 
 def carried_point(body: Body, part: MovingPart, now: Array, position: float) -> Array:
@@ -104,8 +110,18 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
     goal = low + (_OPEN_TO if opening else -0.04) * (high - low)  # shut means pushed against the stop
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
     grip_m = body.spec.hand.tip_m - _PAST_BAR_M
-
     hinged = int(body.world.model.jnt_type[part.joint_id]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+
+    def lid() -> Pull:
+        positions = np.linspace(float(body.world.data.qpos[part.qpos_adr]), goal, _WAYPOINTS)
+        shares = (positions - low) / (high - low)
+        enough = 1 + int(np.argmax(shares > _OPEN_MIN + 0.05 if opening else shares < 0.02))
+        lead = plan_lead(
+            body, arm, lambda q: carried_point(body, part, handle, q), positions, _pointings(body, arm, handle), bar, enough
+        )
+        if lead is None:
+            raise SkillFailure(FailureCode.OBSTRUCTED)
+        return Pull(lead.reach, part, positions[: len(lead.postures)], lead.postures, lead.back_m, lead.opening, lead.closed)
 
     def search() -> Pull | Push:
         if hinged and not opening:
@@ -129,7 +145,7 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
             raise SkillFailure(FailureCode.OBSTRUCTED)
         return best
 
-    return explained(body, {arm: handle}, search)
+    return explained(body, {arm: handle}, lid if part.spec.is_lid else search)
 
 
 def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
@@ -143,6 +159,11 @@ def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
     grip_m = body.spec.hand.tip_m - _PAST_BAR_M
 
     def search() -> Reach:
+        if thing.moving[0].spec.is_lid:
+            reach = plan_tab(body, arm, handle, _pointings(body, arm, handle), bar)
+            if reach is not None:
+                return reach
+            raise SkillFailure(FailureCode.OBSTRUCTED)
         for pointing in _pointings(body, arm, handle):
             reach = plan_reach(body, arm, HandPose(handle - grip_m * pointing, pointing), -pointing, 0.08, bar, pointing=0.7)
             if reach is not None:
@@ -229,10 +250,10 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
     assert arm is not None and action.object_id is not None
     thing, part = body.thing(action.object_id), pull.part
     name = (thing.object_id,)
-    yield from body.move_hand(arm, 1.0, 0.2)
+    yield from body.move_hand(arm, pull.opening, 0.2)
     yield from body.move_arm(arm, [*pull.reach.way, pull.reach.before])
     yield from body.move_arm(arm, [pull.reach.at], speed=0.8)
-    yield from body.move_hand(arm, 0.35, 0.3)
+    yield from body.move_hand(arm, pull.closed, 0.3)
     touched = body.part_geoms(thing, "handle")
     if action.name == "Close":  # a door or drawer can also be pushed shut at its front
         touched = np.flatnonzero(body.world.model.geom_bodyid == part.body_id)
@@ -245,15 +266,45 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
         yield from _leave(body, arm, pull.reach, name)
         code = FailureCode.LOCKED if outcome == "locked" else FailureCode.NOTHING_HAPPENED
         raise SkillFailure(code, contingency=outcome)
-    body.world.attach(arm.value, thing.object_id)
+    if part.spec.is_lid:  # a lid hangs at its tab, a door at the hand around its bar
+        body.world.give_way(thing.object_id, part)
+        yield from wait(0.2)
+        tab = body.world.handle(thing.object_id)
+        body.world.attach(arm.value, thing.object_id, part, tab)
+        pull = _aligned(body, arm, pull, tab)
+    else:
+        body.world.attach(arm.value, thing.object_id, part)
     yield from _lead(body, arm, pull)
     body.world.detach(arm.value)
     yield from body.move_hand(arm, 1.0, 0.2)
     position, hand = body.hand_pose(arm)
-    away = body.solve(arm, HandPose(position - 0.08 * hand[:, 0], hand[:, 0]), start=body.commanded_arm(arm))
-    if away.error_m < 0.03:
-        yield from body.move_arm(arm, [away.q])
+    ways = _off_lid(body, part, body.world.handle(thing.object_id)) if part.spec.is_lid else (-0.08 * hand[:, 0],)
+    for way in ways:
+        away = body.solve(arm, HandPose(position + way, hand[:, 0]), start=body.commanded_arm(arm))
+        if away.error_m < 0.03:
+            yield from body.move_arm(arm, [away.q])
+            break
+    if part.spec.is_lid:  # home over the lid: an arm that sags on its way would push a light object
+        raised = body.vias(arm)[-1]
+        yield from wait(0.1)  # clear of the lid, the hand can touch it again
+        if body.probe.free(arm, [raised]):
+            yield from body.move_arm(arm, [raised], speed=0.7)
     yield from stow(body, arm)
+
+
+def _off_lid(body: Body, part: MovingPart, tab: Array) -> tuple[Array, ...]:
+    """(3,) ways by which a hand leaves a lid, the longest first: up, and outwards over its edge when it is open."""
+    anchor, axis = body.world.data.xanchor[part.joint_id], body.world.data.xaxis[part.joint_id]
+    out = tab - anchor - float(axis @ (tab - anchor)) * axis
+    out /= float(np.linalg.norm(out))
+    way = max(float(out[2]), 0.0) * out + 1.2 * _UP  # a thumb behind the rim of a closed box would draw it along: straight up
+    return tuple(length * way / float(np.linalg.norm(way)) for length in (0.18, 0.12, 0.07))
+
+
+def _aligned(body: Body, arm: Arm, pull: Pull, tab: Array) -> Pull:
+    """The way of a tab from where it is now between the fingers; the planned one where the arm gets less far from there."""
+    postures = led_on(body, arm, lambda q: carried_point(body, pull.part, tab, q), pull.positions, pull.back_m)
+    return replace(pull, postures=postures) if len(postures) == len(pull.positions) else pull
 
 
 def _lead(body: Body, arm: Arm, pull: Pull) -> Skill:
@@ -262,7 +313,7 @@ def _lead(body: Body, arm: Arm, pull: Pull) -> Skill:
     ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
     hinge = abs(float(pull.positions[-1] - pull.positions[0]))
     length = hinge * 0.5 if pull.part.range[1] > 0.6 else hinge
-    duration = 1.875 * max(length, 0.1) / _SPEED
+    duration = 1.875 * max(length, 0.1) / (_LID_SPEED if pull.part.spec.is_lid else _SPEED)
     shares = np.linspace(0.0, 1.0, len(pull.positions))
     steps = max(2, round(duration / CONTROL_DT_S))
     travelled = np.array([min_jerk(k / steps) for k in range(steps + 1)])

@@ -293,9 +293,11 @@ class Body:
     def interaction_point(self, object_id: str) -> Array:
         """(3,) world point that a robot who goes to an object wants before it: handle, inside, switch or centre."""
         thing = self.thing(object_id)
-        if thing.moving and not thing.is_open and thing.moving[0].handle_site >= 0:
+        if thing.movable and thing.type.lidded:  # to lift it as well as to open it
+            return self.world_position(object_id)
+        if thing.is_shut and thing.moving[0].handle_site >= 0:
             return self.world.data.site_xpos[thing.moving[0].handle_site].copy()
-        if thing.moving:
+        if thing.type.encloses:
             surface = thing.surfaces[0]
             local = np.array([surface.spec.rect[0], surface.spec.rect[1], surface.spec.z]) - surface.origin
             return self.world.data.xpos[surface.body_id] + self.world.data.xmat[surface.body_id].reshape(3, 3) @ local
@@ -445,12 +447,20 @@ class Body:
 
     def hand_at(self, arm: Arm, q: Array) -> Array:
         """(3,) world position of the grasp site with an arm posture, from the commanded base."""
+        return self.hand_pose_at(arm, q)[0]
+
+    def hand_pose_at(self, arm: Arm, q: Array, base: Stance | None = None) -> tuple[Array, Array]:
+        """World position (3,) and rotation (3, 3) of the grasp site with an arm posture.
+
+        The base is the commanded one, or another that is turned like it.
+        """
         full = self.kinematics.posture()
         full[self._columns[arm]] = q
         root = np.array([0.0, 0.0, 0.0, *_quaternion_about_y(self.crouches.pitch(self.pelvis_height_m))])
-        base = self.commanded_base()
-        local = self.kinematics.frames(root, full, (self.spec.arms[arm.value].grasp_site,))[0, :3, 3]
-        return self.turn_to_world(local) + (base.x, base.y, self.pelvis_height_m)
+        base = self.commanded_base() if base is None else base
+        frame = self.kinematics.frames(root, full, (self.spec.arms[arm.value].grasp_site,))[0]
+        position = self.turn_to_world(frame[:3, 3]) + (base.x, base.y, self.pelvis_height_m)
+        return position, np.stack([self.turn_to_world(axis) for axis in frame[:3, :3].T], axis=1)
 
     def commanded_arm(self, arm: Arm) -> Array:
         """(A,) commanded arm joints."""

@@ -31,8 +31,7 @@ __all__ = [
 def _check_accessible(body: Body, thing: ObjectInstance) -> None:
     """Refuses objects that are shut away."""
     for name in body.world.parents(thing.object_id):
-        receptacle = body.thing(name)
-        if receptacle.moving and not receptacle.is_open:
+        if body.thing(name).is_shut:
             raise SkillFailure(FailureCode.RECEPTACLE_CLOSED)
 
 
@@ -79,7 +78,7 @@ def _check_receptacle(body: Body, receptacle: ObjectInstance, held: str) -> None
         raise SkillFailure(FailureCode.NOT_RECEPTACLE)
     if receptacle.held_by:
         raise SkillFailure(FailureCode.IN_USE)
-    if receptacle.moving and not receptacle.is_open and all(surface.spec.inside for surface in receptacle.surfaces):
+    if receptacle.is_shut:
         raise SkillFailure(FailureCode.RECEPTACLE_CLOSED)
     _check_accessible(body, receptacle)
 
@@ -104,6 +103,8 @@ def check_toggle(body: Body, arm: Arm, thing: ObjectInstance, on: bool) -> None:
         raise SkillFailure(FailureCode.ALREADY_IN_STATE)
     if thing.is_broken:
         raise SkillFailure(FailureCode.OBJECT_BROKEN)
+    if thing.type.lidded and not thing.is_open:  # the keys of a laptop are below its screen
+        raise SkillFailure(FailureCode.OBSTRUCTED)
 
 
 def _held(body: Body, arm: Arm) -> ObjectInstance:

@@ -26,6 +26,8 @@ __all__ = ["Grasp", "grasp_candidates", "solid_box"]
 
 Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
+#: A lid that is open by less than this share belongs to the box of its object.
+_SHUT_SHARE: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +101,9 @@ def _shape(body: Body, thing: ObjectInstance) -> _Shape:
 
 
 def solid_box(thing: ObjectInstance) -> tuple[Array, Array]:
-    """Bounding box of the parts that can be touched, in the type's frame."""
-    parts = [part for part in thing.type.parts if "ghost" not in part.options]
+    """Bounding box of the parts that can be touched, in the type's frame; what stands open is left out."""
+    shut = [part for moving in thing.type.moving if thing.openness < _SHUT_SHARE for part in moving.parts]
+    parts = [part for part in (*thing.type.parts, *shut) if not part.options & {"ghost", "handle"}]
     low = np.min([np.subtract(part.center, np.multiply(0.5, part.size)) for part in parts], axis=0)
     high = np.max([np.add(part.center, np.multiply(0.5, part.size)) for part in parts], axis=0)
     return low, high

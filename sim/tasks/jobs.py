@@ -49,6 +49,7 @@ class Facts:
         lifted: object in both hands.
         two_handed: ids that need both hands.
         homes: where each object stood at the start, to put strays back.
+        uncovered: ids that open but shut nothing away: a closed one is in nobody's way.
     """
 
     objects: Mapping[str, Mapping[str, Any]]
@@ -56,6 +57,7 @@ class Facts:
     lifted: str | None
     two_handed: frozenset[str]
     homes: Mapping[str, str]
+    uncovered: frozenset[str] = frozenset()
 
     def closed_carrier(self, object_id: str) -> str | None:
         """The closed receptacle around an object, if any."""
@@ -65,9 +67,9 @@ class Facts:
         return None
 
     def is_closed(self, object_id: str) -> bool:
-        """Whether the object opens and is closed."""
+        """Whether the object is closed and its contents are out of reach."""
         entry = self.objects[object_id]
-        return bool(entry["openable"]) and not entry["isOpen"]
+        return bool(entry["openable"]) and not entry["isOpen"] and object_id not in self.uncovered
 
     def free_arms(self) -> tuple[Arm, ...]:
         """Empty hands, the right one first."""
