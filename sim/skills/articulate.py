@@ -384,7 +384,7 @@ def toggle(body: Body, action: Action, luck: Luck) -> Skill:
     thing = body.thing(action.object_id)
     yield from body.move_hand(arm, body.spec.hand.press[2], 0.2)
     yield from body.move_arm(arm, [*reach.way, reach.before])
-    yield from body.move_arm(arm, [reach.at], speed=0.7)
+    yield from body.touch(arm, reach.at, body.part_geoms(thing, "toggle"), speed=0.7)
     yield from wait(0.1)
     gap = body.probe.hand_gap_m(arm, body.part_geoms(thing, "toggle"))
     outcome = luck(action)

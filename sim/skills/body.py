@@ -54,6 +54,8 @@ REACH_TOLERANCE_M: Final = 0.012
 #: How far the ready hand is below the shoulder, as a share of the arm's reach: usually, for robots whose hands would then be
 #: lower than worktops, and with a load of such robots.
 _READY_DROP, _LOW_READY_DROP, _LOW_CARRY_DROP = 0.17, 0.05, -0.16
+#: Share of the shoulders' way forward in a lean by which the robot stands farther from things.
+_LEANING: Final = 0.6
 #: Steps of pelvis height tried when a target is out of reach, metres.
 _HEIGHT_STEP_M: Final = 0.05
 
@@ -250,13 +252,19 @@ class Body:
         return owner
 
     def navigation(self) -> NavigationMap:
-        """Free space for the base, as the room is now."""
-        return navigation_map(self.world, self.spec.footprint_radius_m)
+        """Free space for the base, as the room is now; a robot that leans forward keeps farther away."""
+        return navigation_map(self.world, self.spec.footprint_radius_m + self._leaning_m())
 
     def comfortable_distance_m(self) -> tuple[float, float]:
         """Horizontal distances between pelvis and object at which the arms work best: 55 to 80 % of the stretched arm."""
-        reach = self.maps["left"].reach_m
-        return 0.55 * reach, 0.8 * reach
+        reach, leaning = self.maps["left"].reach_m, self._leaning_m()
+        return 0.55 * reach + leaning, 0.8 * reach + leaning
+
+    def _leaning_m(self) -> float:
+        """By how much the trunk's lean brings the hands forward, the most of it, rounded so that maps are shared."""
+        shoulder = self.maps["left"].shoulder
+        ahead = float((self._lean(self.pelvis_height_m) @ shoulder)[0] - shoulder[0])
+        return round(_LEANING * max(ahead, 0.0), 2)
 
     # ---- objects
 
@@ -620,6 +628,18 @@ class Body:
             time_s += CONTROL_DT_S
             rate = (way.at(time_s + 0.5 * CONTROL_DT_S) - way.at(time_s - 0.5 * CONTROL_DT_S)) / CONTROL_DT_S
             self.world.data.ctrl[ids] = way.at(time_s) + (self._lag_s[ids] * rate if time_s < way.duration_s else 0.0)
+            yield
+
+    def touch(self, arm: Arm, goal: Array, geoms: NDArray[np.int64], speed: float = 1.0) -> Skill:
+        """Moves the arm straight to (A,) joints, and stops where the hand touches one of some geoms."""
+        ids = self._arm_ids[arm]
+        way = plan(
+            np.stack([self.world.data.ctrl[ids].copy(), goal]), ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed * speed
+        )
+        time_s = 0.0
+        while time_s < way.duration_s and self.probe.hand_gap_m(arm, geoms) > 0.0:
+            time_s += CONTROL_DT_S
+            self.world.data.ctrl[ids] = way.at(time_s)
             yield
 
     def command_arm(self, arm: Arm, q: Array) -> None:
