@@ -33,6 +33,10 @@ ROBOT_AFFINITY = 3
 HAND_FRICTION = (1.5, 0.02, 0.001)
 #: Share of the critical damping that keeps the overshoot of a step below 5 %, in postures with more inertia too.
 DAMPING_RATIO = 0.8
+#: Share of it that is friction of the joint; the rest is the servo's.
+PASSIVE_SHARE = 0.15
+#: Parts of the names of joints of hands.
+_FINGERS = ("proximal", "finger")
 NO_CONTACT = {"contype": 0, "conaffinity": 0}
 
 
@@ -53,9 +57,11 @@ def add_servo(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, stiffness: float, for
 
 
 def damp_servos(spec: mujoco.MjSpec) -> None:
-    """Raises the joints' damping to `DAMPING_RATIO` with what each servo moves at the zero pose, links and hand included.
+    """Raises the damping to `DAMPING_RATIO` with what each servo moves at the zero pose, links and hand included.
 
-    `tune_joint` alone knows the reflected inertia only; a waist that carries trunk and arms would swing.
+    `tune_joint` alone knows the reflected inertia only; a waist that carries trunk and arms would swing. Most of the damping
+    is the servo's own, so that it is within the servo's force limit: against a damped joint an elbow could not be moved faster
+    than 2.3 rad/s. Fingers keep theirs in the joint, so that a hand closes slowly with all its force.
     """
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -66,7 +72,13 @@ def damp_servos(spec: mujoco.MjSpec) -> None:
         dof = int(model.joint(servo.target).dofadr[0])
         needed = 2.0 * DAMPING_RATIO * float(np.sqrt(servo.gainprm[0] * inertia[dof, dof]))
         joint = spec.joint(servo.target)
-        joint.damping = [round(max(float(joint.damping[0]), needed), 4), 0.0, 0.0]
+        total = max(float(joint.damping[0]), needed)
+        passive = total if any(part in joint.name for part in _FINGERS) else PASSIVE_SHARE * total
+        joint.damping = [round(passive, 4), 0.0, 0.0]
+        if passive < total:
+            bias = np.array(servo.biasprm)
+            bias[2] = -round(total - passive, 4)
+            servo.biasprm = bias
 
 
 def zero_pose(spec: mujoco.MjSpec) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:

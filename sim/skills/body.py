@@ -53,7 +53,7 @@ HAND_SECONDS: Final = 0.35
 REACH_TOLERANCE_M: Final = 0.012
 #: How far the ready hand is below the shoulder, as a share of the arm's reach: usually, for robots whose hands would then be
 #: lower than worktops, and with a load of such robots.
-_READY_DROP, _LOW_READY_DROP, _LOW_CARRY_DROP = 0.17, 0.05, -0.16
+_READY_DROP, _LOW_READY_DROP, _LOW_CARRY_DROP = 0.17, -0.04, -0.16
 #: Share of the shoulders' way forward in a lean by which the robot stands farther from things.
 _LEANING: Final = 0.6
 #: Steps of pelvis height tried when a target is out of reach, metres.
