@@ -24,6 +24,7 @@ __all__ = [
     "damp_servos",
     "shell",
     "shell_box",
+    "stiffen_limits",
     "tune_joint",
     "zero_pose",
 ]
@@ -32,7 +33,7 @@ ROBOT_BIT = 4
 ROBOT_AFFINITY = 3
 HAND_FRICTION = (1.5, 0.02, 0.001)
 #: Share of the critical damping that keeps the overshoot of a step below 5 %, in postures with more inertia too.
-DAMPING_RATIO = 0.8
+DAMPING_RATIO = 0.9
 #: Share of it that is friction of the joint; the rest is the servo's.
 PASSIVE_SHARE = 0.15
 #: Parts of the names of joints of hands.
@@ -44,6 +45,12 @@ def tune_joint(joint: mujoco.MjsJoint, armature: float, damping: float) -> None:
     """Sets reflected inertia (kg m²) and damping (N m s/rad)."""
     joint.armature = armature
     joint.damping = [damping, 0.0, 0.0]
+
+
+def stiffen_limits(joint: mujoco.MjsJoint) -> None:
+    """Makes the ends of a finger's range hard: a hand that is pressed against furniture must not be bent beyond them."""
+    joint.solref_limit = [0.01, 1.0]
+    joint.solimp_limit = [0.95, 0.99, 0.001, 0.5, 2.0]
 
 
 def add_servo(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, stiffness: float, force: float) -> None:

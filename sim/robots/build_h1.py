@@ -15,7 +15,16 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sim.robots.build_common import HAND_FRICTION, ROBOT_AFFINITY, ROBOT_BIT, add_landmarks, add_servo, damp_servos, tune_joint
+from sim.robots.build_common import (
+    HAND_FRICTION,
+    ROBOT_AFFINITY,
+    ROBOT_BIT,
+    add_landmarks,
+    add_servo,
+    damp_servos,
+    stiffen_limits,
+    tune_joint,
+)
 from sim.robots.csv_tree import LinkRow, add_link, read_rows
 
 __all__ = ["build_h1", "reduce_mesh"]
@@ -190,6 +199,7 @@ def build_h1(menagerie: Path, table: Path, target: Path) -> None:
         servo = next((value for part, value in SERVOS.items() if part in joint.name), None)
         if servo is None:
             tune_joint(joint, armature=0.001, damping=0.05)
+            stiffen_limits(joint)
             if joint.name not in coupled:
                 add_servo(spec, joint, *(THUMB_SERVO if "thumb" in joint.name else FINGER_SERVO))
         else:

@@ -20,6 +20,7 @@ from sim.robots.build_common import (
     damp_servos,
     shell,
     shell_box,
+    stiffen_limits,
     tune_joint,
     zero_pose,
 )
@@ -140,6 +141,7 @@ def build_x1(table: Path, target: Path) -> None:
             continue
         if int(joint.type) == int(mujoco.mjtJoint.mjJNT_SLIDE):
             tune_joint(joint, armature=0.05, damping=10.0)
+            stiffen_limits(joint)
             add_servo(spec, joint, *FINGER_SERVO)
             continue
         stiffness = next(value for part, value in STIFFNESS.items() if part in joint.name)

@@ -215,7 +215,7 @@ def open_close(body: Body, action: Action, luck: Luck) -> Skill:
     assert action.object_id is not None
     thing, opening = body.thing(action.object_id), action.name == "Open"
     outcome = ""
-    for attempt in range(2):
+    for attempt in range(3 if not opening else 2):
         try:
             pull = assess_open_close(body, action)
         except SkillFailure:

@@ -139,11 +139,15 @@ def _level_way(body: Body, arm: Arm, held: str, goal: Array) -> list[Array]:
     return way
 
 
+#: A small way of the hand that takes more of a joint than this would turn what the hand holds.
+_NUDGE_RAD: Final = 0.6
+
+
 def nudge(body: Body, arm: Arm, change: Array) -> Skill:
     """Moves the hand by a small way in the world, as far as the arm can."""
     position, hand = body.hand_pose(arm)
     goal = body.solve(arm, HandPose(position + change, hand[:, 0], hand[:, 1]), start=body.commanded_arm(arm))
-    if goal.error_m < 0.03:
+    if goal.error_m < 0.03 and float(np.max(np.abs(goal.q - body.commanded_arm(arm)))) < _NUDGE_RAD:
         yield from body.move_arm(arm, [goal.q], speed=0.6)
 
 

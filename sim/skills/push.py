@@ -76,6 +76,8 @@ _BONE_M: Final = 0.035
 _HAND_M: Final = 0.14
 #: Turn of the door from which on the fist has met it.
 _NUDGED_RAD: Final = 0.02
+#: Turn of the door in the step before the push from which on the plan does not hold any more.
+_TAKEN_ALONG_RAD: Final = 0.15
 #: Peak speed of the free edge, m/s.
 _EDGE_SPEED: Final = 0.4
 #: How much deeper than in its push a fist may come to a door while it is drawn back.
@@ -515,6 +517,8 @@ def _route(
 def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
     """Steps to the stance, brings the fist to the face, pushes along the arc, draws the fist back and goes home.
 
+    Where the step takes the door along, it ends there: the rest has to be planned again.
+
     Raises:
         SkillFailure: GraspMissed when the fist does not come to the door, or a contingency.
     """
@@ -522,6 +526,8 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
     assert arm is not None and action.object_id is not None
     if push.way is not None:
         yield from step_to(body, push.way, float(push.stances[0, 2]))
+        if abs(float(body.world.data.qpos[part.qpos_adr]) - float(push.positions[0])) > _TAKEN_ALONG_RAD:
+            return
     yield from body.move_hand(arm, 0.0, 0.2)
     yield from body.move_arm(arm, [*push.reach.way, push.reach.before])
     yield from body.move_arm(arm, [push.reach.at], speed=0.5)
