@@ -43,6 +43,8 @@ _DIRECTIONS: Final = {"MoveAhead": 0.0, "MoveLeft": np.pi / 2, "MoveBack": np.pi
 _SIDESTEP_M: Final = 0.5
 #: Metres of walking that one radian off the object's face is worth.
 _FACE_WEIGHT: Final = 3.0
+#: Lengths of the last step of GoTo, straight ahead, that are tried in turn.
+_LAST_STEP_M: Final = (0.35, 0.25, 0.15)
 #: Preference of near over exact: metres of walking that one metre of deviation from the comfortable distance is worth.
 _DISTANCE_WEIGHT: Final = 6.0
 #: Stances that are asked whether the hands fit there, and how much more than the best one they may cost.
@@ -134,9 +136,27 @@ def _settle(body: Body) -> Skill:
         yield
 
 
+def _length_m(path: NDArray[np.float64]) -> float:
+    """Length of a polyline (N, 2)."""
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+
+
+def _before(body: Body, start: Stance, stance: Stance) -> NDArray[np.float64] | None:
+    """A polyline (N, 2) to a place from which a straight step ahead leads to a stance, None when there is none."""
+    ahead = np.array([np.cos(stance.yaw_rad), np.sin(stance.yaw_rad)])
+    navigation = body.navigation()
+    for distance in _LAST_STEP_M:
+        place = stance.position - distance * ahead
+        if navigation.is_free(place) and navigation.segment_free(place, stance.position):
+            path = navigation.path(start.position, place)
+            if path is not None and _length_m(path) > 0.01:
+                return path
+    return None
+
+
 def step_to(body: Body, path: NDArray[np.float64], yaw_rad: float) -> Skill:
     """Sidesteps along a polyline (N, 2) to a stance close by, then turns into its heading."""
-    if float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) > 0.01:
+    if _length_m(path) > 0.01:
         yield from _walk(body, path, along=False)
     yield from _turn(body, yaw_rad)
     yield from _settle(body)
@@ -278,12 +298,17 @@ def go_to(body: Body, action: Action) -> Skill:
     if found is None:
         raise SkillFailure(FailureCode.NO_FREE_POSE)
     stance, path = found
-    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-    if length > 0.01:
-        along = length > _SIDESTEP_M
+    if _length_m(path) > 0.01:
+        along = _length_m(path) > _SIDESTEP_M
+        before = _before(body, start, stance) if along else None
+        if before is not None:
+            path = before
         if along:
             first = path[min(1, len(path) - 1)] - path[0]
             yield from _turn(body, float(np.arctan2(first[1], first[0])))
         yield from _walk(body, path, along)
+        if before is not None:  # the last steps straight ahead: hands that turn above a table sweep it
+            yield from _turn(body, stance.yaw_rad)
+            yield from _walk(body, np.stack([path[-1], stance.position]), along=False)
     yield from _turn(body, stance.yaw_rad)
     yield from _settle(body)
