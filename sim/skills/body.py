@@ -28,11 +28,11 @@ from sim.objects import ObjectInstance
 from sim.placement import OVERHANG_SHARE
 from sim.robots.arm_ik import PerArmSolver
 from sim.robots.build_solver import RobotKit, robot_kit
-from sim.robots.footsteps import footsteps
 from sim.robots.self_collision import SELF_TOUCH_M
 from sim.robots.solver import ReachTarget
 from sim.scene import BASE_JOINTS
 from sim.skills.clearance import ClearanceProbe
+from sim.skills.footsteps import footsteps
 from sim.skills.gait import leg_motion
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach_map import WOUND_RAD, HandPose, ReachMap, reach_maps
@@ -130,6 +130,9 @@ class Body:
         }
         self._waist_ids = np.array([self._actuators[name] for name in self.spec.waist_joints])
         self._lag_s = _lags(model)
+        self._arm_adr = {
+            arm: np.array([int(model.joint(n).qposadr[0]) for n in self.spec.arms[arm.value].joints]) for arm in Arm
+        }
         self._leg_ids = np.array([self._actuators[name] for name in self.spec.leg_joints])
         self._hand_joints = np.array([int(model.joint(n).id) for arm in Arm for n in self.spec.arms[arm.value].hand_joints])
         sliding = model.jnt_type[self._hand_joints] == int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -222,26 +225,33 @@ class Body:
         base_ids = np.array([self._base[0], self._base[1], self._base[3]])
         return _ahead(way, self._lag_s[base_ids]), _ahead(legs, self._lag_s[self._leg_ids])
 
-    def pressed_m(self) -> float:
-        """How deep the robot presses into anything that it does not hold, metres."""
+    def _pressed(self) -> tuple[float, bool]:
+        """How deep the robot presses into anything that it does not hold, metres, and whether it touches anything."""
         data = self.world.data
         if data.ncon == 0:
-            return 0.0
+            return 0.0, False
         owner = self._contact_owner()[data.contact.geom[: data.ncon]]  # (C, 2): 1 robot, 0 held, -1 else
         touching = np.prod(owner, axis=1) < 0
-        return float(-np.min(data.contact.dist[: data.ncon][touching], initial=0.0))
+        return float(-np.min(data.contact.dist[: data.ncon][touching], initial=0.0)), bool(touching.any())
 
     def fits(self, stance: Stance) -> bool:
         """Whether arms and hands, as they are commanded, would touch nothing at a stance."""
         with self.considering_stance(stance):
             return all(self.probe.free(arm, [self.commanded_arm(arm)]) for arm in Arm)
 
-    def strain(self) -> float:
-        """How far the hands' joints are bent beyond their limits: rad, and metres of sliding joints divided by 0.2."""
-        model = self.world.model
-        values, scale = self.world.data.qpos[model.jnt_qposadr[self._hand_joints]], self._hand_scale
+    def pushed(self) -> Array:
+        """(3,) how much the robot is pushed by what it runs into.
+
+        How deep it presses (m), how far the hands' joints are bent beyond their limits (rad, and m / 0.2 of sliding ones), and
+        how far an arm's joint is from its target (rad), which is what yields first; 0 for the last one while nothing touches.
+        """
+        model, data = self.world.model, self.world.data
+        depth_m, touches = self._pressed()
+        values, scale = data.qpos[model.jnt_qposadr[self._hand_joints]], self._hand_scale
         low, high = model.jnt_range[self._hand_joints].T
-        return float(np.max(np.maximum(low - values, values - high) / scale, initial=0.0))
+        bent = float(np.max(np.maximum(low - values, values - high) / scale, initial=0.0))
+        off = max(float(np.max(np.abs(data.qpos[self._arm_adr[arm]] - data.ctrl[self._arm_ids[arm]]))) for arm in Arm)
+        return np.array([depth_m, bent, off if touches else 0.0])
 
     def _contact_owner(self) -> NDArray[np.int64]:
         """(ngeom,) 1 for the robot's geoms, 0 for those of what it holds, -1 for all others."""

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robots.footsteps import Footsteps
+from sim.skills.footsteps import Footsteps
 
 __all__ = ["leg_motion"]
 

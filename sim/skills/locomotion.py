@@ -31,10 +31,9 @@ TURN_ACCELERATION_RAD_S2: Final = 5.0
 HEIGHT_SPEED_M_S: Final = 0.35
 HEIGHT_ACCELERATION_M_S2: Final = 1.0
 
-#: How deep an arm may press into something before the base stops, and by how much (rad, or m times 0.2) fingers may be bent
-#: beyond their limits.
-_PRESSED_M: Final = 0.03
-_STRAIN: Final = 0.04
+#: What a walk goes on under, as `Body.pushed` gives it: an arm that presses into something (m), fingers bent beyond their range
+#: (rad, or m / 0.2), an arm pushed away from where it is held (rad).
+_PUSHED: Final = np.array([0.03, 0.04, 0.3])
 _RETREAT_S: Final = 0.35
 
 #: Heading of a step relative to the robot's own, by action.
@@ -101,14 +100,12 @@ def _travel(body: Body, way: NDArray[np.float64]) -> Skill:
     start = body.commanded_base()
     way = np.concatenate([[(start.x, start.y, start.yaw_rad)], way])  # (T + 1, 3)
     bases, legs = body.walking_targets(way)
-    press_m, strain = (
-        max(limit, now + 0.5 * limit) for limit, now in ((_PRESSED_M, body.pressed_m()), (_STRAIN, body.strain()))
-    )
+    limits = np.maximum(_PUSHED, body.pushed() + 0.5 * _PUSHED)
     for tick in range(1, len(way)):
         body.command_base(*map(float, bases[tick]))
         body.command_legs(legs[tick])
         yield
-        if body.strain() > strain or body.pressed_m() > press_m:
+        if np.any(body.pushed() > limits):
             yield from _retreat(body, way[: tick + 1], legs)
             walked = float(np.linalg.norm(body.commanded_base().position - start.position))
             raise SkillFailure(FailureCode.BLOCKED_PATH, {"travel_m": walked})
@@ -121,7 +118,7 @@ def _retreat(body: Body, way: NDArray[np.float64], legs: NDArray[np.float64]) ->
         body.command_base(*map(float, way[tick]))
         body.command_legs(legs[tick])
         yield
-        if body.strain() <= 0.5 * _STRAIN and body.pressed_m() <= 0.5 * _PRESSED_M:
+        if np.all(body.pushed() <= 0.5 * _PUSHED):
             break
     for share in np.linspace(0.0, 1.0, round(0.3 / CONTROL_DT_S))[1:]:
         body.command_legs((1.0 - share) * legs[tick] + share * legs[0])
