@@ -21,21 +21,25 @@ from sim.objects import ObjectPlacement
 from sim.robots.spec import available_robots
 from sim.session import FreePlay, Session
 from sim.video import VideoRecorder
+from sim.world import World
 
 __all__ = ["SCENES", "Scene", "film", "main"]
 
 _TABLE: Final = "DiningTable_1"
-_STILLS: Final = 6
+#: Stills of a strip, evenly over the film, and control ticks between those that are taken.
+_STILLS: Final = 9
+_STRIDE: Final = 20
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is filmed: objects, states of furniture, and steps."""
+    """What is filmed: objects, states of furniture, and steps, in which `{arm}` is the arm of `arms` or the right one."""
 
     steps: tuple[str, ...]
     placements: tuple[ObjectPlacement, ...] | None = None
     states: Mapping[str, Mapping[str, bool | float | str]] = field(default_factory=dict)
     room: str = "kitchen_1"
+    arms: Mapping[str, str] = field(default_factory=dict)
 
 
 def _on(name: str, x: float, y: float, **state: bool | float | str) -> ObjectPlacement:
@@ -52,6 +56,9 @@ SCENES: Final[Mapping[str, Scene]] = {
         (_on("Mug_1", 1.5, -0.83), _on("Cup_1", 1.78, -0.83)),
     ),
     "open_door": Scene(("GoTo(Microwave_1)", "Open(left, Microwave_1)"), ()),
+    "close_door": Scene(("GoTo(Cabinet_1)", "Close(right, Cabinet_1)"), (), {"Cabinet_1": {"isOpen": True}}),
+    "open_lid": Scene(("GoTo(LaundryHamper_1)", "Open(right, LaundryHamper_1)"), room="bedroom_1"),
+    "close_lid": Scene(("GoTo(Book_1)", "Close(right, Book_1)"), (_on("Book_1", 1.6, -0.85, isOpen=True),)),
     "open_drawer": Scene(("GoTo(Drawer_1)", "Open(right, Drawer_1)"), ()),
     "close_drawer": Scene(("GoTo(Drawer_1, auto, -25)", "Close(right, Drawer_1)"), (), {"Drawer_1": {"isOpen": True}}),
     "toggle": Scene(("GoTo(StoveKnob_1)", "ToggleOn(left, StoveKnob_1)", "ToggleOff(left, StoveKnob_1)"), ()),
@@ -70,9 +77,11 @@ SCENES: Final[Mapping[str, Scene]] = {
         (_on("Cup_1", 1.5, -0.85, fillLiquid="wine"), _on("Bowl_1", 1.8, -0.8)),
     ),
     "fill": Scene(
-        ("GoTo(Mug_1)", "Pick(right, Mug_1)", "GoTo(Faucet_1)", "Fill(right, Faucet_1)"),
-        (ObjectPlacement("Mug_1", "CounterTop_1", (-0.5, 2.2)),),
+        ("GoTo(Mug_1)", "Pick({arm}, Mug_1)", "GoTo(Faucet_1)", "Fill({arm}, Faucet_1)"),
+        (ObjectPlacement("Mug_1", "CounterTop_1", (-0.6, 2.1)),),
         {"Faucet_1": {"isToggled": True}},
+        "kitchen_2",
+        {"x1": "left"},
     ),
     "lift": Scene(
         ("GoTo(Box_1)", "Lift(Box_1)", "GoTo(Desk_1)", "PlaceBoth(Desk_1)"),
@@ -89,14 +98,21 @@ def film(name: str, robot: str, folder: Path, size: int = 360) -> bool:
     session = Session(robot, image_size=0, all_known=True)
     session.reset(FreePlay(scene.room, name.replace("_", " "), placements=scene.placements, states=scene.states), 0)
     stills: list[NDArray[np.uint8]] = []
-    fine = True
+    fine, ticks = True, 0
+
+    def watch(world: World, _text: str) -> None:
+        nonlocal ticks
+        ticks += 1
+        if ticks % _STRIDE == 0:
+            stills.append(np.concatenate([world.render(camera, 240, 240).rgb for camera in ("left", "head")], axis=0))
+
+    session.watchers.append(watch)
     with VideoRecorder(session, folder / f"{name}_{robot}.mp4", ("behind", "left", "head"), size) as video:
         for text in scene.steps:
-            fine &= _act(session, text, video)
-            views = [session.world.render(camera, 240, 240).rgb for camera in ("left", "head")]
-            stills.append(np.concatenate(views, axis=0))
+            fine &= _act(session, text.format(arm=scene.arms.get(robot, "right")), video)
     session.close()
-    iio.imwrite(folder / f"{name}_{robot}.png", np.concatenate(stills[-_STILLS:], axis=1))
+    chosen = np.linspace(0, len(stills) - 1, min(_STILLS, len(stills))).round().astype(int)
+    iio.imwrite(folder / f"{name}_{robot}.png", np.concatenate([stills[index] for index in chosen], axis=1))
     return fine
 
 

@@ -21,7 +21,8 @@ from sim.failures import FailureCode, SkillFailure
 from sim.navigation import Stance
 from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import ArmGoal, Body, wait
-from sim.skills.clearance import TOUCH_M, AtDoor
+from sim.skills.clearance import TOUCH_M
+from sim.skills.door import Door
 from sim.skills.locomotion import step_to
 from sim.skills.manipulate import GRASP_GAP_M, stow
 from sim.skills.obstacles import navigation_map
@@ -30,7 +31,7 @@ from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.trajectory import min_jerk
 
-__all__ = ["Door", "Push", "plan_push", "push_shut"]
+__all__ = ["Push", "plan_push", "push_shut"]
 
 Array = NDArray[np.float64]
 
@@ -70,10 +71,6 @@ _TRIALS_EXPLAINING: Final = 4
 _HAND_ROOM_M: Final = 0.004
 #: The same for a hand behind the door: its fingers would hook the door as they close.
 _FINGERS_M: Final = 0.035
-#: Thickness of an upper arm or forearm around its bone.
-_BONE_M: Final = 0.035
-#: Length of a hand before its wrist, measured from the grasp site.
-_HAND_M: Final = 0.14
 #: Turn of the door from which on the fist has met it.
 _NUDGED_RAD: Final = 0.02
 #: Turn of the door in the step before the push from which on the plan does not hold any more.
@@ -84,105 +81,6 @@ _EDGE_SPEED: Final = 0.4
 _CATCH_M: Final = 0.004
 #: How far a posture may be from the one before.
 _JUMP_RAD: Final = 0.9
-
-
-@dataclass(frozen=True, slots=True)
-class Door:
-    """The geometry of a hinged door.
-
-    Attributes:
-        part: its joint.
-        anchor: (3,) a point of the hinge.
-        axis: (3,) unit vector along it.
-        front: (3,) outward normal of the shut door.
-        side: (3,) direction of the shut door from the hinge to the free edge.
-        width_m: distance from the hinge to the free edge.
-        face_m: how far the outside face is in front of the hinge.
-        back_m: how far the inside face is in front of the hinge.
-        heights: (low, high) of the panel, world.
-        now: present joint position.
-    """
-
-    part: MovingPart
-    anchor: Array
-    axis: Array
-    front: Array
-    side: Array
-    width_m: float
-    face_m: float
-    back_m: float
-    heights: tuple[float, float]
-    now: float
-
-    @staticmethod
-    def of(body: Body, thing: ObjectInstance, part: MovingPart) -> Door:
-        """Reads a door off the model."""
-        model, data = body.world.model, body.world.data
-        panel = max(
-            (int(geom) for geom in np.flatnonzero(model.geom_bodyid == part.body_id)),
-            key=lambda geom: float(np.prod(model.geom_aabb[geom, 3:])),
-        )
-        center, half = model.geom_pos[panel], model.geom_aabb[panel, 3:]
-        sign = 1.0 if center[0] > 0.0 else -1.0
-        frame = data.xmat[thing.body_id].reshape(3, 3)
-        anchor = data.xanchor[part.joint_id].copy()
-        height = float(anchor[2] + center[2])
-        return Door(
-            part=part,
-            anchor=anchor,
-            axis=data.xaxis[part.joint_id].copy(),
-            front=-frame[:, 1].copy(),
-            side=sign * frame[:, 0].copy(),
-            width_m=float(abs(center[0]) + half[0]),
-            face_m=float(half[1] - center[1]),
-            back_m=float(-half[1] - center[1]),
-            heights=(height - float(half[2]), height + float(half[2])),
-            now=float(data.qpos[part.qpos_adr]),
-        )
-
-    def _turned(self, direction: Array, position: float) -> Array:
-        c, s = np.cos(position), np.sin(position)
-        return c * direction + s * np.cross(self.axis, direction)
-
-    def normal(self, position: float) -> Array:
-        """(3,) outward normal of the door at a joint position."""
-        return self._turned(self.front, position)
-
-    def along(self, position: float) -> Array:
-        """(3,) direction from the hinge to the free edge at a joint position."""
-        return self._turned(self.side, position)
-
-    def point(self, position: float, along_m: float, height_m: float, out_m: float = 0.0) -> Array:
-        """(3,) point so far from the hinge, at a world height, and so far before the outside face."""
-        found = self.anchor + along_m * self.along(position) + (self.face_m + out_m) * self.normal(position)
-        return np.array([found[0], found[1], height_m])
-
-    def distance_m(self, points: Array, position: float) -> Array:
-        """(N,) horizontal distances between floor points (N, 2) and the door at a joint position."""
-        delta = points - self.anchor[:2]
-        u, v = delta @ self.along(position)[:2], delta @ self.normal(position)[:2]
-        outside_u = np.maximum(np.maximum(-u, u - self.width_m), 0.0)
-        outside_v = np.maximum(np.maximum(self.back_m - v, v - self.face_m), 0.0)
-        return np.hypot(outside_u, outside_v)
-
-    def before(self, state: AtDoor, position: float) -> bool:
-        """Whether the whole hand is on the outer side of the door."""
-        return float(np.min((state.hand - self.anchor) @ self.normal(position))) >= self.face_m
-
-    def outside(self, state: AtDoor, position: float) -> bool:
-        """Whether the hand is before the door and neither forearm nor upper arm passes through it."""
-        if not self.before(state, position):
-            return False
-        shoulder, elbow, site = state.bones
-        forearm = float(np.linalg.norm(site - elbow))
-        wrist = elbow + (site - elbow) * max(forearm - _HAND_M, 0.0) / max(forearm, 1e-9)  # the hand itself touches the door
-        shares = np.linspace(0.0, 1.0, 15)[:, None]
-        line = np.concatenate([shoulder + shares * (elbow - shoulder), elbow + shares * (wrist - elbow)])
-        delta = line - self.anchor
-        u, v = delta @ self.along(position), delta @ self.normal(position)
-        inside = (u > -0.05) & (u < self.width_m + _BONE_M) & (v > self.back_m - _BONE_M) & (v < self.face_m + 0.4 * _BONE_M)
-        inside &= (line[:, 2] > self.heights[0] - _BONE_M) & (line[:, 2] < self.heights[1] + _BONE_M)
-        return not bool(np.any(inside))
 
 
 @dataclass(frozen=True, slots=True)
