@@ -29,9 +29,10 @@ MAX_SIZE: Final = 1280
 _MAX_GEOMS: Final = 1500
 #: A geom group that is not drawn.
 _UNSEEN_GROUP: Final = 5
-#: Cameras that go with the robot around it; they stay inside the room and before the furniture.
+#: Cameras that go with the robot around it; they stay before the furniture.
 _FOLLOWING: Final = ("front", "left", "right", "behind")
-_WALL_GAP_M: Final = 0.12
+_CLOSEST_M: Final = 1.2
+_FURNITURE_GAP_M: Final = 0.12
 _ROBOT: Final = -2
 _NOTHING: Final = -1
 
@@ -64,7 +65,7 @@ def camera_intrinsics(world: World, camera: str, height: int, width: int) -> NDA
 
 
 def camera_pose(world: World, camera: str) -> NDArray[np.float64]:
-    """(4, 4) pose of a camera in the world, x right, y down, z forward; one around the robot comes closer before a wall."""
+    """(4, 4) pose of a camera in the world, x right, y down, z forward; one around the robot comes closer before furniture."""
     index, pose = _camera_id(world, camera), np.eye(4)
     pose[:3, :3] = world.data.cam_xmat[index].reshape(3, 3) * np.array([1.0, -1.0, -1.0])
     pose[:3, 3] = _unobstructed(world, index) if camera in _FOLLOWING else world.data.cam_xpos[index]
@@ -72,22 +73,26 @@ def camera_pose(world: World, camera: str) -> NDArray[np.float64]:
 
 
 def _unobstructed(world: World, camera: int) -> NDArray[np.float64]:
-    """(3,) place of a camera around the robot, drawn in along its sight to where no wall or furniture is in between."""
+    """(3,) place of a camera around the robot, drawn in along its sight to before the furniture.
+
+    Walls are looked through from outside. Furniture that is close to the robot is not avoided: the picture would show little
+    of the robot but its back.
+    """
     model, data = world.model, world.data
     target, place = data.xpos[int(model.cam_bodyid[camera])], data.cam_xpos[camera]
     away = place - target
     length = float(np.linalg.norm(away))
-    hit, free, start = np.zeros(1, dtype=np.int32), length + _WALL_GAP_M, 0.0
+    hit, start = np.zeros(1, dtype=np.int32), _CLOSEST_M
     furniture = np.array([1, 1, 0, 0, 0, 0], dtype=np.uint8)  # the robot's own geoms are in other groups
-    while start < free:
+    while start < length + _FURNITURE_GAP_M:
         distance = mujoco.mj_ray(model, data, target + start * away / length, away / length, furniture, 1, -1, hit)
         if distance < 0.0:
             break
         start += distance + 0.01
-        if int(model.body_weldid[model.geom_bodyid[hit[0]]]) == 0:  # what can move may be looked through
-            free = min(free, start - 0.01)
-            break
-    return target + away / length * max(free - _WALL_GAP_M, 0.3)
+        fixed = int(model.body_weldid[model.geom_bodyid[hit[0]]]) == 0  # what can move may be looked through
+        if fixed and int(model.geom_type[hit[0]]) != int(mujoco.mjtGeom.mjGEOM_PLANE):
+            return target + away / length * min(start - 0.01 - _FURNITURE_GAP_M, length)
+    return place.copy()
 
 
 def _camera_id(world: World, camera: str) -> int:
