@@ -63,7 +63,7 @@ def _turn_by(body: Body, change_rad: float) -> Skill:
     yield from _travel(body, np.array([(start.x, start.y, start.yaw_rad + turn) for turn in turns]))
 
 
-def _walk(body: Body, path: NDArray[np.float64], along: bool) -> Skill:
+def _walk(body: Body, path: NDArray[np.float64], along: bool, limits: NDArray[np.float64] = _PUSHED) -> Skill:
     """Follows a polyline; `along` turns the heading into the way as it goes, at a bounded rate."""
     way = plan_polyline(path, WALK_SPEED_M_S, WALK_ACCELERATION_M_S2)
     yaw = body.commanded_base().yaw_rad
@@ -76,7 +76,7 @@ def _walk(body: Body, path: NDArray[np.float64], along: bool) -> Skill:
                 error = wrap_angle(float(np.arctan2(ahead[1], ahead[0])) - yaw)
                 yaw += float(np.clip(4.0 * error, -TURN_SPEED_RAD_S, TURN_SPEED_RAD_S)) * CONTROL_DT_S
         poses.append((float(x), float(y), yaw))
-    yield from _travel(body, np.array(poses))
+    yield from _travel(body, np.array(poses), limits)
 
 
 def _ticks(duration_s: float) -> list[float]:
@@ -87,7 +87,7 @@ def _ticks(duration_s: float) -> list[float]:
     return times[1:]
 
 
-def _travel(body: Body, way: NDArray[np.float64]) -> Skill:
+def _travel(body: Body, way: NDArray[np.float64], limits: NDArray[np.float64] = _PUSHED) -> Skill:
     """Takes the base along a way (T, 3) of x, y and yaw, with walking legs; a hand that runs into something ends it.
 
     What presses at the start may go on pressing a little, so that the robot can walk away from it.
@@ -100,7 +100,7 @@ def _travel(body: Body, way: NDArray[np.float64]) -> Skill:
     start = body.commanded_base()
     way = np.concatenate([[(start.x, start.y, start.yaw_rad)], way])  # (T + 1, 3)
     bases, legs = body.walking_targets(way)
-    limits = np.maximum(_PUSHED, body.pushed() + 0.5 * _PUSHED)
+    limits = np.maximum(limits, body.pushed() + 0.5 * _PUSHED)
     for tick in range(1, len(way)):
         body.command_base(*map(float, bases[tick]))
         body.command_legs(legs[tick])
@@ -152,9 +152,12 @@ def _before(body: Body, start: Stance, stance: Stance) -> NDArray[np.float64] | 
 
 
 def step_to(body: Body, path: NDArray[np.float64], yaw_rad: float) -> Skill:
-    """Sidesteps along a polyline (N, 2) to a stance close by, then turns into its heading."""
+    """Sidesteps along a polyline (N, 2) to a stance close by, then turns into its heading.
+
+    The arms may be pushed aside farther than in other walks: the way leads around an open door.
+    """
     if _length_m(path) > 0.01:
-        yield from _walk(body, path, along=False)
+        yield from _walk(body, path, along=False, limits=_PUSHED * (1.0, 1.0, 2.0))
     yield from _turn(body, yaw_rad)
     yield from _settle(body)
 
