@@ -11,6 +11,7 @@ from sim.gl import RenderingError, select_backend
 from sim.objects import ObjectPlacement
 from sim.rendering import CAMERAS, Renderer
 from sim.robots.spec import load_robot
+from sim.rooms import room_names
 from sim.world import World
 
 
@@ -123,6 +124,18 @@ def test_leaving_out_what_is_not_in_view_changes_no_pixel(room: str) -> None:
             for name in ("rgb", "depth", "segmentation"):
                 assert np.array_equal(getattr(culled, name), getattr(whole, name)), (camera, name)
     assert renderer._out_of_view(int(world.model.camera(world.robot.head_camera).id)).mean() > 0.2  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("room", room_names())
+def test_cameras_around_the_robot_see_it_and_the_head_sees_no_sky(room: str) -> None:
+    world = World(load_robot("x1"), room, placements=[])
+    for yaw in (0.0, 2.0, -2.0):
+        world.put_base(*world.base_pose[:2], yaw)
+        views = {camera: world.render(camera, 112, 112, segmentation=True) for camera in ("front", "left", "right", "behind")}
+        hidden = [camera for camera, view in views.items() if (view.segmentation == -2).sum() <= 250]
+        assert len(hidden) <= 1, (hidden, yaw)  # furniture beside the robot may stand between
+        head = world.render("head", 112, 112, depth=True).depth
+        assert head is not None and head.max() < 12.0, "walls and ceiling close the room"
 
 
 def test_canvases_that_are_given_up_harm_no_other() -> None:
