@@ -72,9 +72,13 @@ def observe(
         step_budget: number of steps allowed.
     """
     size = image_size or _PROBE_SIZE
-    view = world.render("head", size, size, segmentation=True)
-    visible = visible_ids(world.visible_objects(view.segmentation), world.objects)
-    image: NDArray[np.uint8] = view.rgb if image_size else np.zeros((0, 0, 3), dtype=np.uint8)
+    image: NDArray[np.uint8] = np.zeros((0, 0, 3), dtype=np.uint8)
+    if image_size:
+        view = world.render("head", size, size, segmentation=True)
+        image, labels = view.rgb, view.segmentation
+    else:
+        labels = world.labels("head", size, size)
+    visible = visible_ids(world.visible_objects(labels), world.objects)
     assert world.robot is not None
     return Observation(
         instruction=instruction,

@@ -156,12 +156,8 @@ class Renderer:
         normals = data.geom_xmat[planes].reshape(-1, 3, 3)[:, :, 2]
         return planes[np.einsum("pi,pi->p", place - data.geom_xpos[planes], normals) < 0.0]
 
-    def view(self, camera: str = "head", *, depth: bool = False, segmentation: bool = False) -> View:
-        """Draws one camera as the world is now.
-
-        Raises:
-            ValueError: on an unknown camera.
-        """
+    def _look(self, camera: str) -> NDArray[np.float64]:
+        """Brings the scene up to date for a camera; its (4, 4) pose."""
         world = self._world
         index = self._camera.fixedcamid = _camera_id(world, camera)
         mujoco.mj_camlight(world.model, world.data)
@@ -178,6 +174,24 @@ class Renderer:
         mujoco.mjv_updateScene(world.model, world.data, self._option, None, self._camera, everything, self._scene)
         groups[:] = kept
         world.data.cam_xpos[index] = place
+        return pose
+
+    def labels(self, camera: str = "head") -> NDArray[np.int32]:
+        """(H, W) segmentation of one camera as in `View`, without drawing its colours.
+
+        Raises:
+            ValueError: on an unknown camera.
+        """
+        self._look(camera)
+        return self._labels[self._canvas.depth_and_geoms(self._world.model, self._scene)[1]]
+
+    def view(self, camera: str = "head", *, depth: bool = False, segmentation: bool = False) -> View:
+        """Draws one camera as the world is now.
+
+        Raises:
+            ValueError: on an unknown camera.
+        """
+        world, pose = self._world, self._look(camera)
         distances = labels = None
         if depth or segmentation:
             metres, geoms = self._canvas.depth_and_geoms(world.model, self._scene)

@@ -93,6 +93,11 @@ def test_two_sizes_and_repeated_pictures_are_equal(world: World) -> None:
     assert world.render("front", 60, 90).rgb.shape == (60, 90, 3)
 
 
+def test_labels_alone_are_those_of_a_picture(world: World) -> None:
+    for camera in ("head", "behind", "plan"):
+        assert np.array_equal(world.labels(camera, 96, 128), world.render(camera, 96, 128, segmentation=True).segmentation)
+
+
 def test_bad_requests_are_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="unknown camera 'rear'"):
         world.render("rear")
