@@ -84,7 +84,7 @@ SCENES: Final[Mapping[str, Scene]] = {
         {"x1": "left"},
     ),
     "lift": Scene(
-        ("GoTo(Box_1)", "Lift(Box_1)", "GoTo(Desk_1)", "PlaceBoth(Desk_1)"),
+        ("GoTo(Box_1)", "Lift(Box_1)", "MoveUp(0.18)", "GoTo(Desk_1)", "PlaceBoth(Desk_1)"),
         (ObjectPlacement("Box_1", "CoffeeTable_1", (0.0, -0.56)),),
         {},
         "living_room_1",
