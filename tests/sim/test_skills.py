@@ -101,7 +101,7 @@ def places(session, door):
 def test_a_door_that_stands_open_is_pushed_shut(session, door):
     start(session, FreePlay("kitchen_1", states={door: {"isOpen": True}}, placements=THINGS))
     before = places(session, door)
-    assert act(session, f"GoTo({door})")[0].success
+    assert act(session, f"GoTo({door})")[0].code in ("", "BlockedPath")  # an arm may run into the open door on the way
     outcome = close_with_some_arm(session, door)
     assert outcome.success, outcome
     assert session.world.objects[door].openness < 0.12
