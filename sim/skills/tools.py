@@ -7,6 +7,7 @@ are states of DualTHOR without an action.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -97,11 +98,7 @@ def slice_object(body: Body, action: Action, luck: Luck) -> Skill:
         SkillFailure: what `assess_slice` refuses, ToolMissed, or a contingency.
     """
     reach = assess_slice(body, action)
-    assert action.arm is not None and action.object_id is not None
-    thing, tool = body.thing(action.object_id), body.thing(body.held[action.arm] or "")
-    yield from _apply(body, action, reach, tool, thing, luck)
-    body.world.set_state(thing.object_id, "isSliced", True)
-    yield from _leave(body, action.arm, reach, tool)
+    yield from _apply(body, action, reach, luck, lambda thing: body.world.set_state(thing.object_id, "isSliced", True))
 
 
 def clean(body: Body, action: Action, luck: Luck) -> Skill:
@@ -111,13 +108,13 @@ def clean(body: Body, action: Action, luck: Luck) -> Skill:
         SkillFailure: what `assess_clean` refuses, ToolMissed, or a contingency.
     """
     reach = assess_clean(body, action)
-    assert action.arm is not None and action.object_id is not None
-    thing, tool = body.thing(action.object_id), body.thing(body.held[action.arm] or "")
-    yield from _apply(body, action, reach, tool, thing, luck)
-    wipe(body.world, thing.object_id)
-    if thing.state.isDirty:
-        body.world.set_state(thing.object_id, "isDirty", False)
-    yield from _leave(body, action.arm, reach, tool)
+
+    def effect(thing: ObjectInstance) -> None:
+        wipe(body.world, thing.object_id)
+        if thing.state.isDirty:
+            body.world.set_state(thing.object_id, "isDirty", False)
+
+    yield from _apply(body, action, reach, luck, effect)
 
 
 def use_up(body: Body, action: Action, luck: Luck) -> Skill:
@@ -150,14 +147,15 @@ def _judge(gap_m: float, outcome: str) -> None:
         raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
 
 
-def _apply(body: Body, action: Action, reach: Reach, tool: ObjectInstance, thing: ObjectInstance, luck: Luck) -> Skill:
-    """Brings the tool onto the object, presses until it touches, and draws it to and fro.
+def _apply(body: Body, action: Action, reach: Reach, luck: Luck, effect: Callable[[ObjectInstance], None]) -> Skill:
+    """Brings the tool in the hand onto the object, presses until it touches, draws it to and fro, and has its effect.
 
     Raises:
         SkillFailure: ToolMissed or a contingency, with the arm at home again.
     """
     arm = action.arm
-    assert arm is not None
+    assert arm is not None and action.object_id is not None
+    thing, tool = body.thing(action.object_id), body.thing(body.held[arm] or "")
     yield from body.move_arm(arm, [*reach.way, reach.before])
     yield from body.move_arm(arm, [reach.at], speed=0.6)
     mine, theirs = body.solid_geoms(tool), body.solid_geoms(thing)
@@ -174,6 +172,8 @@ def _apply(body: Body, action: Action, reach: Reach, tool: ObjectInstance, thing
         for _ in range(_STROKES):
             yield from nudge(body, arm, _STROKE_M * along)
             yield from nudge(body, arm, -_STROKE_M * along)
+        effect(thing)
+        yield from _leave(body, arm, reach, tool)
         return
     yield from _leave(body, arm, reach, tool)
     _judge(gap, outcome)
