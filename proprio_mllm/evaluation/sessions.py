@@ -58,7 +58,8 @@ class SimSession:
         """Which goals hold now."""
         metadata = self.session.world.metadata()
         met = tuple(goal.holds(metadata) for goal in self.task.goals)
-        unmet = {name for goal, holds in zip(self.task.goals, met, strict=True) if not holds for name in goal.object_ids()}
+        ids = tuple(entry["objectId"] for entry in metadata["objects"])
+        unmet = {name for goal, holds in zip(self.task.goals, met, strict=True) if not holds for name in goal.involved(ids)}
         return GoalReport(met, frozenset(unmet))
 
     def stats(self) -> Stats:
