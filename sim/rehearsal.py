@@ -86,7 +86,8 @@ class Rehearsal:
             try:
                 if session.assess(first) is not None:
                     return False
-                return session.act(PlanStep((first,))).outcomes[0].success and session.assess(then) is None
+                _, feedback = session.step(PlanStep((first,)))  # it also looks: what was shut away is known afterwards
+                return feedback.outcomes[0].success and session.assess(then) is None
             finally:
                 session.body.hurried = False
 

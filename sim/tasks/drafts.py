@@ -192,9 +192,10 @@ class Builder:
         self.draft.states.setdefault(switch, {})["isToggled"] = on
         return switch
 
-    def container(self, is_open: bool, falls_shut: bool = False) -> str:
+    def container(self, is_open: bool, falls_shut: bool = False, among: Sequence[str] = ()) -> str:
         """A container of the room that is closed, or `is_open`, at the start, and may shut by itself."""
-        container = self.choose(self.scene.containers, "container")
+        options = [name for name in self.scene.containers if not among or name.rsplit("_", 1)[0] in among]
+        container = self.choose(options, "container")
         state = self.draft.states.setdefault(container, {})
         state["isOpen"] = is_open
         if falls_shut:

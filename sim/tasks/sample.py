@@ -53,8 +53,8 @@ TRAIN_SEEDS: Final = range(100_000, 2**31)
 
 #: Types that tasks have carried with both hands.
 _BIG_TYPES: Final = ("Box", "HousePlant", "Pot", "Toaster", "Microwave", "CoffeeMachine", "LaundryHamper", "GarbageCan")
-#: What a robot's two arms do not get around, whatever the furniture.
-_TOO_WIDE: Final[Mapping[str, tuple[str, ...]]] = {"x1": ("Pot",)}
+#: Those that stand with a short side to the front, because the shorter robot's arms do not get around the long one.
+_TURNED: Final = ("Pot", "Toaster")
 _SURFACE_TYPES: Final = (
     "CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser", "TVStand", "Shelf", "Bed", "Sofa", "Chair",
 )  # fmt: skip
@@ -172,10 +172,6 @@ def settle(draft: Draft, task_id: str, seed: int, source: str, rng: np.random.Ge
         WorldError: when the objects do not fit, or one of the robots cannot reach what it has to touch from anywhere.
     """
     scene = scene_of(draft.room)
-    for name in robots:
-        wide = [item for item in draft.objects if item.rsplit("_", 1)[0] in _TOO_WIDE.get(name, ())]
-        if wide:
-            raise WorldError(f"{name} does not get around {wide[0]}")
     empty = _empty_world(draft.room)
     spots = _spots(empty, draft, rng)
     placements = tuple(
@@ -250,7 +246,8 @@ def _spots(empty: World, draft: Draft, rng: np.random.Generator) -> dict[str, ND
     taken: list[tuple[NDArray[np.float64], float, str]] = []
     for name, carrier in draft.objects.items():
         kind = catalogue.get(name.rsplit("_", 1)[0])
-        radius, narrow = float(np.hypot(kind.size[0], kind.size[1])) / 2.0, min(kind.size[0], kind.size[1]) / 2.0
+        radius, depth = float(np.hypot(kind.size[0], kind.size[1])) / 2.0, min(kind.size[0], kind.size[1])
+        narrow = (max(kind.size[0], kind.size[1]) if kind.name in _TURNED else depth) / 2.0
         if kind.name in _BIG_TYPES:
             narrow *= OVERHANG_SHARE
         band = narrow + 0.06 if kind.name in _BIG_TYPES else max(_EDGE_BAND_M, narrow + 0.05)
@@ -307,11 +304,12 @@ def _in_reach(robot: str, navigation: NavigationMap, point: NDArray[np.float64])
 
 
 def _yaw_deg(rng: np.random.Generator, empty: World, name: str, carrier: str) -> float:
-    """Small objects stand roughly square to the furniture; big ones with their long side along its front, within reach."""
+    """Small objects stand roughly square to the furniture; big ones square to it, within reach."""
     rotation = empty.pose(carrier)[:2, :2]
     along = float(np.rad2deg(np.arctan2(rotation[1, 0], rotation[0, 0])))
-    if name.rsplit("_", 1)[0] in _BIG_TYPES:
-        return along
+    kind = name.rsplit("_", 1)[0]
+    if kind in _BIG_TYPES:
+        return along + (90.0 if kind in _TURNED else 0.0)
     return along + float(rng.choice((0.0, 90.0, 180.0, 270.0))) + float(rng.integers(-3, 4)) * 5.0
 
 
