@@ -156,8 +156,7 @@ def test_acting_out_gives_pictures_goals_and_what_differs(acted_run: Path, monke
     # A second report reads what is kept: nothing is acted out.
     monkeypatch.setattr("proprio_mllm.report.frames.run_jobs", None)
     assert run_data(run, "all", 64, 0).acted == data.acted
-    (kept,) = (acted_run / "frames").iterdir()
-    assert kept.name == f"{episode_id(record)}-64.json"
+    assert (acted_run / "frames" / f"{episode_id(record)}-64.json").is_file()
 
 
 def test_a_step_that_ends_otherwise_is_marked(acted_run: Path, tmp_path: Path) -> None:
@@ -292,3 +291,14 @@ def test_narrow_and_printed(browser: Browser, pages: Path) -> None:
     browser.eval("dispatchEvent(new Event('beforeprint'))")
     assert len(browser.eval(ROWS)) == 11
     assert len(browser.pdf()) > 20_000
+
+
+@pytest.mark.chromium
+def test_the_policy_holds_even_if_markup_got_in(browser: Browser, pages: Path) -> None:
+    browser.open(pages)
+    handler = "<img src='data:image/png;base64,AA' onerror='document.title=1'><img src='file:///nothing.png' id='outside'>"
+    browser.eval(f"document.body.insertAdjacentHTML('beforeend', {json.dumps(handler)})")
+    assert browser.eval("fetch('file:///etc/hostname').then(() => 'read', () => 'refused')") == "refused"
+    browser.eval("new Promise((done) => setTimeout(done, 200))")
+    assert browser.eval("document.title") != "1"
+    assert sum("Content Security Policy" in message for message in browser.messages) >= 3
