@@ -25,13 +25,13 @@ from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
 from sim.skills.lids import led_on, plan_lead, plan_tab
+from sim.skills.locomotion import sweep
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
 from sim.skills.push import Push, plan_push, push_shut
 from sim.skills.reach import Reach, explained, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
-from sim.skills.runner import CONTROL_DT_S, Skill
-from sim.trajectory import min_jerk
+from sim.skills.runner import Skill
 
 __all__ = ["assess_open_close", "assess_toggle", "open_close", "plan_handle", "plan_press", "toggle"]
 
@@ -314,18 +314,9 @@ def _lead(body: Body, arm: Arm, pull: Pull) -> Skill:
     hinge = abs(float(pull.positions[-1] - pull.positions[0]))
     length = hinge * 0.5 if pull.part.range[1] > 0.6 else hinge
     duration = 1.875 * max(length, 0.1) / (_LID_SPEED if pull.part.spec.is_lid else _SPEED)
-    shares = np.linspace(0.0, 1.0, len(pull.positions))
-    steps = max(2, round(duration / CONTROL_DT_S))
-    travelled = np.array([min_jerk(k / steps) for k in range(steps + 1)])
-    spots = base.position - pull.back_m * travelled[:, None] * ahead
-    way = np.column_stack([spots, np.full(steps + 1, base.yaw_rad)])
-    bases, legs = body.walking_targets(way)
-    for k in range(1, steps + 1):
-        body.command_arm(arm, np.array([np.interp(travelled[k], shares, column) for column in pull.postures.T]))
-        if pull.back_m > 0.0:
-            body.command_base(*map(float, bases[k]))
-            body.command_legs(legs[k])
-        yield
+    back = np.linspace(0.0, pull.back_m, len(pull.positions))[:, None] * ahead
+    stances = np.column_stack([base.position - back, np.full(len(back), base.yaw_rad)])
+    yield from sweep(body, arm, pull.postures, stances, duration)
     yield from wait(0.1)
 
 

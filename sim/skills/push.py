@@ -23,13 +23,12 @@ from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import ArmGoal, Body, wait
 from sim.skills.clearance import TOUCH_M
 from sim.skills.door import Door
-from sim.skills.locomotion import step_to
+from sim.skills.locomotion import step_to, sweep
 from sim.skills.manipulate import GRASP_GAP_M, stow
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach import Reach, route
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import CONTROL_DT_S, Skill
-from sim.trajectory import min_jerk
+from sim.skills.runner import Skill
 
 __all__ = ["Push", "plan_push", "push_shut"]
 
@@ -441,18 +440,9 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
         yield from _draw_back(body, arm, push.reach.before[None])
         code = FailureCode.LOCKED if outcome == "locked" else FailureCode.NOTHING_HAPPENED
         raise SkillFailure(code, contingency=outcome)
-    shares = np.linspace(0.0, 1.0, len(push.positions))
     stances = push.stances + (0.0, 0.0, body.commanded_base().yaw_rad - push.stances[0, 2])  # the same turn of the heading
     turn = abs(float(push.positions[-1] - push.positions[0]))
-    steps = max(2, round(1.875 * max(0.5 * turn, 0.1) / _EDGE_SPEED / CONTROL_DT_S))
-    ways = np.array([min_jerk(k / steps) for k in range(steps + 1)])
-    way = np.column_stack([np.interp(ways, shares, column) for column in stances.T])
-    bases, legs = body.walking_targets(way)
-    for k in range(1, steps + 1):
-        body.command_arm(arm, np.array([np.interp(ways[k], shares, column) for column in push.postures.T]))
-        body.command_base(*map(float, bases[k]))
-        body.command_legs(legs[k])
-        yield
+    yield from sweep(body, arm, push.postures, stances, 1.875 * max(0.5 * turn, 0.1) / _EDGE_SPEED)
     yield from wait(0.2)
     yield from _draw_back(body, arm, push.away)
 
