@@ -1,9 +1,9 @@
 """Open, Close, ToggleOn, ToggleOff: hands on handles and switches.
 
 The hand goes to the handle until it touches it, then leads it along the door's arc or the drawer's slide; a ball joint at the
-grasp stands for the fingers around the bar. Where the arm cannot follow all the way, the robot steps back with it. A hinged
-door is shut by pushing its outside (`sim.skills.push`), by its handle only where that does not work. What counts is the joint's
-position afterwards. A switch flips when a finger touches it.
+grasp stands for the fingers around the bar. Where the arm cannot follow all the way, the robot steps back with it. A door or
+drawer is shut by pushing its outside (`sim.skills.push`), by its handle only where that does not work. What counts is the
+joint's position afterwards. A switch flips when a finger touches it.
 
 Paper: Open and Toggle of the DualTHOR action space; Close is ours.
 """
@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -110,7 +109,6 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
     goal = low + (_OPEN_TO if opening else -0.04) * (high - low)  # shut means pushed against the stop
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
     grip_m = body.spec.hand.tip_m - _PAST_BAR_M
-    hinged = int(body.world.model.jnt_type[part.joint_id]) == int(mujoco.mjtJoint.mjJNT_HINGE)
 
     def lid() -> Pull:
         positions = np.linspace(float(body.world.data.qpos[part.qpos_adr]), goal, _WAYPOINTS)
@@ -124,7 +122,7 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
         return Pull(lead.reach, part, positions[: len(lead.postures)], lead.postures, lead.back_m, lead.opening, lead.closed)
 
     def search() -> Pull | Push:
-        if hinged and not opening:
+        if not opening:
             push = plan_push(body, arm, thing, part)
             if push is not None:
                 return push
@@ -311,8 +309,7 @@ def _lead(body: Body, arm: Arm, pull: Pull) -> Skill:
     """Moves hand and, where planned, base along the planned way."""
     base = body.commanded_base()
     ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
-    hinge = abs(float(pull.positions[-1] - pull.positions[0]))
-    length = hinge * 0.5 if pull.part.range[1] > 0.6 else hinge
+    length = pull.part.travel_m(float(pull.positions[-1] - pull.positions[0]))
     duration = 1.875 * max(length, 0.1) / (_LID_SPEED if pull.part.spec.is_lid else _SPEED)
     back = np.linspace(0.0, pull.back_m, len(pull.positions))[:, None] * ahead
     stances = np.column_stack([base.position - back, np.full(len(back), base.yaw_rad)])
