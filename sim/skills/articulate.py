@@ -10,7 +10,7 @@ Paper: Open and Toggle of the DualTHOR action space; Close is ours.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -23,11 +23,11 @@ from sim.navigation import Stance
 from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
-from sim.skills.lids import led_on, plan_lead, plan_tab
+from sim.skills.lids import closed_on, led_on, plan_lead, plan_tab
 from sim.skills.locomotion import sweep
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
 from sim.skills.push import Push, plan_push, push_shut
-from sim.skills.reach import Reach, explained, fulfils, plan_reach
+from sim.skills.reach import Reach, explained, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
 from sim.skills.runner import Skill
@@ -48,6 +48,8 @@ _OPEN_MIN: Final = 0.35
 _OPEN_WELL: Final = 0.6
 _CLOSED_MAX: Final = 0.12
 _WAYPOINTS: Final = 9
+#: Waypoints of a lid's way that Close leads it at least before it takes it again, where no pelvis height serves for all of it.
+_PART_WAY: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +62,7 @@ class Pull:
         positions: (N,) joint positions along the way.
         postures: (N, A) arm joints that go with them.
         back_m: how far the base steps back on the way.
+        opening, closed: opening of the hand on arrival, and around the handle.
     """
 
     reach: Reach
@@ -67,9 +70,8 @@ class Pull:
     positions: Array
     postures: Array
     back_m: float
-    #: Opening of the hand on arrival, and around the handle.
-    opening: float = 1.0
-    closed: float = 0.35
+    opening: float
+    closed: float
 
 
 def carried_point(body: Body, part: MovingPart, now: Array, position: float) -> Array:
@@ -93,6 +95,32 @@ def _pointings(body: Body, arm: Arm, point: Array) -> Iterator[Array]:
             yield np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
 
 
+def _grips(body: Body, arm: Arm, thing: ObjectInstance, handle: Array) -> Iterator[HandPose]:
+    """Hand poses around a bar: two parallel fingers rather close on it from both sides, five hook it anyhow."""
+    grip_m = body.spec.hand.tip_m - _PAST_BAR_M
+    if body.spec.hand.pinch_m is None:
+        along = _bar_axis(body, thing)
+        for pointing in _pointings(body, arm, handle):
+            across = np.cross(along, pointing)
+            across /= max(float(np.linalg.norm(across)), 1e-9)
+            yield HandPose(handle - grip_m * pointing, pointing, across, either_way=True)
+    for pointing in _pointings(body, arm, handle):
+        yield HandPose(handle - grip_m * pointing, pointing)
+
+
+def _bar_axis(body: Body, thing: ObjectInstance) -> Array:
+    """(3,) direction along the bar of a handle."""
+    model, data = body.world.model, body.world.data
+    bar = max(map(int, body.part_geoms(thing, "handle")), key=lambda geom: float(np.max(model.geom_aabb[geom, 3:])))
+    return data.geom_xmat[bar].reshape(3, 3)[:, int(np.argmax(model.geom_aabb[bar, 3:]))].copy()
+
+
+def _to_bar(body: Body, arm: Arm, wish: HandPose, bar: Sequence[int]) -> Reach | None:
+    """How the open hand comes to a bar, straight ahead of its fingers."""
+    assert wish.pointing is not None
+    return plan_reach(body, arm, wish, -wish.pointing, 0.08, bar, pointing=0.7, closing=0.7)
+
+
 @remembered
 def assess_open_close(body: Body, action: Action) -> Pull | Push:
     """What Open or Close would do.
@@ -108,18 +136,19 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
     low, high = part.range
     goal = low + (_OPEN_TO if opening else -0.04) * (high - low)  # shut means pushed against the stop
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
-    grip_m = body.spec.hand.tip_m - _PAST_BAR_M
 
-    def lid() -> Pull:
+    def lid(enough: int) -> Pull:
         positions = np.linspace(float(body.world.data.qpos[part.qpos_adr]), goal, _WAYPOINTS)
-        shares = (positions - low) / (high - low)
-        enough = 1 + int(np.argmax(shares > _OPEN_MIN + 0.05 if opening else shares < 0.02))
         lead = plan_lead(
             body, arm, lambda q: carried_point(body, part, handle, q), positions, _pointings(body, arm, handle), bar, enough
         )
         if lead is None:
             raise SkillFailure(FailureCode.OBSTRUCTED)
         return Pull(lead.reach, part, positions[: len(lead.postures)], lead.postures, lead.back_m, lead.opening, lead.closed)
+
+    def whole_lid() -> Pull:
+        shares = (np.linspace(float(body.world.data.qpos[part.qpos_adr]), goal, _WAYPOINTS) - low) / (high - low)
+        return lid(1 + int(np.argmax(shares > _OPEN_MIN + 0.05 if opening else shares < 0.02)))
 
     def search() -> Pull | Push:
         if not opening:
@@ -128,9 +157,8 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
                 return push
         best: Pull | None = None
         tried = 0
-        for pointing in _pointings(body, arm, handle):
-            wish = HandPose(handle - grip_m * pointing, pointing)
-            reach = plan_reach(body, arm, wish, -pointing, 0.08, bar, pointing=0.7)
+        for wish in _grips(body, arm, thing, handle):
+            reach = _to_bar(body, arm, wish, bar)
             if reach is None:
                 continue
             tried += 1
@@ -143,7 +171,18 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
             raise SkillFailure(FailureCode.OBSTRUCTED)
         return best
 
-    return explained(body, {arm: handle}, lid if part.spec.is_lid else search)
+    if not part.spec.is_lid:
+        return explained(body, {arm: handle}, search)
+    try:
+        return explained(body, {arm: handle}, whole_lid)
+    except SkillFailure as failure:
+        other_height = failure.code in (FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW)
+        if opening or thing.movable or other_height or body.hurried:
+            raise
+        try:
+            return lid(_PART_WAY)  # the lid of a fixture stays where it is left, and is taken again from there
+        except SkillFailure:
+            raise failure from None
 
 
 def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
@@ -154,7 +193,6 @@ def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
     """
     handle = body.world.handle(thing.object_id)
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
-    grip_m = body.spec.hand.tip_m - _PAST_BAR_M
 
     def search() -> Reach:
         if thing.moving[0].spec.is_lid:
@@ -162,8 +200,8 @@ def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
             if reach is not None:
                 return reach
             raise SkillFailure(FailureCode.OBSTRUCTED)
-        for pointing in _pointings(body, arm, handle):
-            reach = plan_reach(body, arm, HandPose(handle - grip_m * pointing, pointing), -pointing, 0.08, bar, pointing=0.7)
+        for wish in _grips(body, arm, thing, handle):
+            reach = _to_bar(body, arm, wish, bar)
             if reach is not None:
                 return reach
         raise SkillFailure(FailureCode.OBSTRUCTED)
@@ -192,7 +230,7 @@ def _plan_pull(body: Body, arm: Arm, part: MovingPart, reach: Reach, hand: Array
             postures.append(solved.q)
         count = len(postures)
         share = back * (count - 1) / (_WAYPOINTS - 1)
-        pull = Pull(reach, part, positions[:count], np.stack(postures), share)
+        pull = Pull(reach, part, positions[:count], np.stack(postures), share, 1.0, closed_on(body))
         if best is None or count > len(best.positions):
             best = pull
         if count == _WAYPOINTS:
@@ -216,16 +254,16 @@ def open_close(body: Body, action: Action, luck: Luck) -> Skill:
     for attempt in range(3 if not opening else 2):
         try:
             pull = assess_open_close(body, action)
+            if not outcome:
+                outcome = luck(action)
+            if isinstance(pull, Push):
+                yield from push_shut(body, action, pull, outcome)
+            else:
+                yield from _pull(body, action, pull, outcome)
         except SkillFailure:
             if attempt == 0:
                 raise
-            break
-        if not outcome:
-            outcome = luck(action)
-        if isinstance(pull, Push):
-            yield from push_shut(body, action, pull, outcome)
-        else:
-            yield from _pull(body, action, pull, outcome)
+            break  # what the first time has done counts
         if _share(body, pull.part) >= _OPEN_WELL if opening else _share(body, pull.part) <= _CLOSED_MAX:
             return
     if opening and _share(body, thing.moving[0]) >= _OPEN_MIN:
@@ -285,8 +323,9 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
     if part.spec.is_lid:  # home over the lid: an arm that sags on its way would push a light object
         raised = body.vias(arm)[-1]
         yield from wait(0.1)  # clear of the lid, the hand can touch it again
-        if body.probe.free(arm, [raised]):
-            yield from body.move_arm(arm, [raised], speed=0.7)
+        way = route(body, arm, body.commanded_arm(arm), raised)
+        if way is not None:
+            yield from body.move_arm(arm, [*way, raised], speed=0.7)
     yield from stow(body, arm)
 
 
