@@ -324,8 +324,8 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
         raised = body.vias(arm)[-1]
         yield from wait(0.1)  # clear of the lid, the hand can touch it again
         way = route(body, arm, body.commanded_arm(arm), raised)
-        if way is not None:
-            yield from body.move_arm(arm, [*way, raised], speed=0.7)
+        if way is not None or body.probe.free(arm, [raised]):
+            yield from body.move_arm(arm, [*(way or ()), raised], speed=0.7)
     yield from stow(body, arm)
 
 
