@@ -112,6 +112,10 @@ class MovingPart:
     handle_site: int
     spec: MovingSpec
 
+    def travel_m(self, change: float) -> float:
+        """About how far the handle moves while the joint does by `change`: a door's is half a metre from its hinge."""
+        return abs(change) * (0.5 if self.spec.joint == "hinge" else 1.0)
+
 
 @dataclass(frozen=True, slots=True)
 class Surface:

@@ -14,7 +14,7 @@ from proprio_mllm.evaluation.ledger import read_ledger
 from proprio_mllm.report.summary import CATEGORIES, SUMMARY_VERSION, Row, rows_of, write_json
 from proprio_mllm.report.table import Table, run_table
 
-__all__ = ["Run", "find_runs", "load_run", "newest", "run_report", "write_report"]
+__all__ = ["Run", "find_runs", "load_run", "newest", "run_notes", "run_report", "write_report"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,8 @@ def find_runs(output: Path) -> list[Run]:
     return [load_run(path.parent) for path in paths]
 
 
-def _notes(run: Run) -> list[str]:
+def run_notes(run: Run) -> list[str]:
+    """What to know about a run besides its figures: episodes without a score, broken attempts, a privileged planner."""
     notes = []
     missing = len(run.metadata["planned"]) - len(run.records)
     if missing:
@@ -95,7 +96,7 @@ def _notes(run: Run) -> list[str]:
 def run_report(run: Run) -> Table:
     """The table of a run."""
     meta = run.metadata
-    return run_table(f"{meta['label']} · {meta['robot']} · {meta['difficulty']}", run.rows(), _notes(run))
+    return run_table(f"{meta['label']} · {meta['robot']} · {meta['difficulty']}", run.rows(), run_notes(run))
 
 
 def write_report(run: Run) -> Table:

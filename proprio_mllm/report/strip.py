@@ -18,14 +18,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from configs.schema.eval import EvalConfig
-from configs.validate import build
-from data.records import ActionError, EpisodeRecord, PlanStep
-from proprio_mllm.evaluation.run import select_tasks
-from proprio_mllm.evaluation.seeds import episode_seed
-from proprio_mllm.evaluation.sessions import started
+from proprio_mllm.report.reenact import Reenactment, RunTasks, find_record
 from proprio_mllm.report.runs import Run, load_run
-from sim.session import Session
 
 __all__ = ["Frame", "draw_strip", "main", "replay"]
 
@@ -42,14 +36,6 @@ class Frame:
     failed: bool
 
 
-def _find(run: Run, task: str, trial: int) -> EpisodeRecord:
-    for record in run.records:
-        if (record.task, record.trial) == (task, trial):
-            return record
-    names = ", ".join(sorted({record.task for record in run.records}))
-    raise ValueError(f"{run.folder}: no episode of task {task!r}, trial {trial}; it has {names}")
-
-
 def replay(run: Run, task: str, trial: int = 0, size: int = 320, camera: str = "behind") -> list[Frame]:
     """Acts an episode out again.
 
@@ -64,38 +50,18 @@ def replay(run: Run, task: str, trial: int = 0, size: int = 320, camera: str = "
         The start and one frame per step.
 
     Raises:
-        ValueError: when the run has no such episode.
+        ValueError: when the run has no such episode, or its task has changed.
     """
-    record = _find(run, task, trial)
-    cfg = build(EvalConfig, run.metadata["config"], "run.json config")
-    found = next(one for one in select_tasks(cfg) if one.id == task)
-    luck = episode_seed(record.seed, task, record.robot, trial)
-    session = Session(cfg.robot.spec or cfg.robot.name, cfg.difficulty, 0)
-    session.reset(started(found, cfg.start, luck), seed=luck)
-
-    def frame(text: str, failed: bool) -> Frame:
-        world = session.world
+    reenactment = Reenactment(RunTasks(run).episode(find_record(run, task, trial)))
+    world = reenactment.session.world
+    frames: list[Frame] = []
+    for moment in reenactment.moments():
         views = [world.render(name, size, size).rgb for name in ("head", camera)]
-        return Frame(views[0], views[1], text, failed)
-
-    frames = [frame(f"start: {found.instruction}", False)]
-    for entry in record.trace:
-        text, outcomes = str(entry["step"]), entry["outcomes"]
-        assert isinstance(outcomes, Sequence)
-        codes = [str(outcome["code"]) for outcome in outcomes]
-        try:
-            step = PlanStep.parse(text)
-        except ActionError:
-            frames.append(frame(f"{text[:60]}\n{codes[0]}", True))
-            continue
-        # Looking around decides what is known, so it is part of acting the episode out.
-        _, feedback = session.step(step)
-        again = [outcome.code for outcome in feedback.outcomes]
-        if again != codes:
-            logger.warning("%s: %s gave %s, the ledger says %s", task, text, again, codes)
-        words = " ".join(code or "ok" for code in again) + ("" if again == codes else " (differs from the ledger)")
-        frames.append(frame(f"{text}\n{words}", any(again)))
-    session.close()
+        words = " ".join(code or "ok" for code in moment.codes) + (" (differs from the ledger)" if moment.differs else "")
+        if moment.differs:
+            logger.warning("%s: %s gave %s, the ledger says %s", task, moment.text, moment.codes, moment.expected)
+        text = f"{moment.text[:60]}\n{words}" if moment.number else f"start: {reenactment.episode.task.instruction}"
+        frames.append(Frame(views[0], views[1], text, any(moment.codes)))
     return frames
 
 
@@ -132,7 +98,7 @@ def main(arguments: Sequence[str]) -> int:
     folder, task = Path(arguments[0]), arguments[1]
     try:
         run, trial = load_run(folder), int(options.get("trial", "0"))
-        record = _find(run, task, trial)
+        record = find_record(run, task, trial)
         frames = replay(run, task, trial, camera=options.get("camera", "behind"))
     except ValueError as error:
         sys.stderr.write(f"strip: {error}\n")

@@ -1,20 +1,19 @@
 """Open, Close, ToggleOn, ToggleOff: hands on handles and switches.
 
 The hand goes to the handle until it touches it, then leads it along the door's arc or the drawer's slide; a ball joint at the
-grasp stands for the fingers around the bar. Where the arm cannot follow all the way, the robot steps back with it. A hinged
-door is shut by pushing its outside (`sim.skills.push`), by its handle only where that does not work. What counts is the joint's
-position afterwards. A switch flips when a finger touches it.
+grasp stands for the fingers around the bar. Where the arm cannot follow all the way, the robot steps back with it. A door or
+drawer is shut by pushing its outside (`sim.skills.push`), by its handle only where that does not work. What counts is the
+joint's position afterwards. A switch flips when a finger touches it.
 
 Paper: Open and Toggle of the DualTHOR action space; Close is ours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,14 +23,14 @@ from sim.navigation import Stance
 from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
-from sim.skills.lids import led_on, plan_lead, plan_tab
+from sim.skills.lids import closed_on, led_on, plan_lead, plan_tab
+from sim.skills.locomotion import sweep
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
 from sim.skills.push import Push, plan_push, push_shut
-from sim.skills.reach import Reach, explained, fulfils, plan_reach
+from sim.skills.reach import Reach, explained, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
-from sim.skills.runner import CONTROL_DT_S, Skill
-from sim.trajectory import min_jerk
+from sim.skills.runner import Skill
 
 __all__ = ["assess_open_close", "assess_toggle", "open_close", "plan_handle", "plan_press", "toggle"]
 
@@ -49,6 +48,8 @@ _OPEN_MIN: Final = 0.35
 _OPEN_WELL: Final = 0.6
 _CLOSED_MAX: Final = 0.12
 _WAYPOINTS: Final = 9
+#: Waypoints of a lid's way that Close leads it at least before it takes it again, where no pelvis height serves for all of it.
+_PART_WAY: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +62,7 @@ class Pull:
         positions: (N,) joint positions along the way.
         postures: (N, A) arm joints that go with them.
         back_m: how far the base steps back on the way.
+        opening, closed: opening of the hand on arrival, and around the handle.
     """
 
     reach: Reach
@@ -68,9 +70,8 @@ class Pull:
     positions: Array
     postures: Array
     back_m: float
-    #: Opening of the hand on arrival, and around the handle.
-    opening: float = 1.0
-    closed: float = 0.35
+    opening: float
+    closed: float
 
 
 def carried_point(body: Body, part: MovingPart, now: Array, position: float) -> Array:
@@ -94,6 +95,32 @@ def _pointings(body: Body, arm: Arm, point: Array) -> Iterator[Array]:
             yield np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
 
 
+def _grips(body: Body, arm: Arm, thing: ObjectInstance, handle: Array) -> Iterator[HandPose]:
+    """Hand poses around a bar: two parallel fingers rather close on it from both sides, five hook it anyhow."""
+    grip_m = body.spec.hand.tip_m - _PAST_BAR_M
+    if body.spec.hand.pinch_m is None:
+        along = _bar_axis(body, thing)
+        for pointing in _pointings(body, arm, handle):
+            across = np.cross(along, pointing)
+            across /= max(float(np.linalg.norm(across)), 1e-9)
+            yield HandPose(handle - grip_m * pointing, pointing, across, either_way=True)
+    for pointing in _pointings(body, arm, handle):
+        yield HandPose(handle - grip_m * pointing, pointing)
+
+
+def _bar_axis(body: Body, thing: ObjectInstance) -> Array:
+    """(3,) direction along the bar of a handle."""
+    model, data = body.world.model, body.world.data
+    bar = max(map(int, body.part_geoms(thing, "handle")), key=lambda geom: float(np.max(model.geom_aabb[geom, 3:])))
+    return data.geom_xmat[bar].reshape(3, 3)[:, int(np.argmax(model.geom_aabb[bar, 3:]))].copy()
+
+
+def _to_bar(body: Body, arm: Arm, wish: HandPose, bar: Sequence[int]) -> Reach | None:
+    """How the open hand comes to a bar, straight ahead of its fingers."""
+    assert wish.pointing is not None
+    return plan_reach(body, arm, wish, -wish.pointing, 0.08, bar, pointing=0.7, closing=0.7)
+
+
 @remembered
 def assess_open_close(body: Body, action: Action) -> Pull | Push:
     """What Open or Close would do.
@@ -109,13 +136,9 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
     low, high = part.range
     goal = low + (_OPEN_TO if opening else -0.04) * (high - low)  # shut means pushed against the stop
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
-    grip_m = body.spec.hand.tip_m - _PAST_BAR_M
-    hinged = int(body.world.model.jnt_type[part.joint_id]) == int(mujoco.mjtJoint.mjJNT_HINGE)
 
-    def lid() -> Pull:
+    def lid(enough: int) -> Pull:
         positions = np.linspace(float(body.world.data.qpos[part.qpos_adr]), goal, _WAYPOINTS)
-        shares = (positions - low) / (high - low)
-        enough = 1 + int(np.argmax(shares > _OPEN_MIN + 0.05 if opening else shares < 0.02))
         lead = plan_lead(
             body, arm, lambda q: carried_point(body, part, handle, q), positions, _pointings(body, arm, handle), bar, enough
         )
@@ -123,16 +146,19 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
             raise SkillFailure(FailureCode.OBSTRUCTED)
         return Pull(lead.reach, part, positions[: len(lead.postures)], lead.postures, lead.back_m, lead.opening, lead.closed)
 
+    def whole_lid() -> Pull:
+        shares = (np.linspace(float(body.world.data.qpos[part.qpos_adr]), goal, _WAYPOINTS) - low) / (high - low)
+        return lid(1 + int(np.argmax(shares > _OPEN_MIN + 0.05 if opening else shares < 0.02)))
+
     def search() -> Pull | Push:
-        if hinged and not opening:
+        if not opening:
             push = plan_push(body, arm, thing, part)
             if push is not None:
                 return push
         best: Pull | None = None
         tried = 0
-        for pointing in _pointings(body, arm, handle):
-            wish = HandPose(handle - grip_m * pointing, pointing)
-            reach = plan_reach(body, arm, wish, -pointing, 0.08, bar, pointing=0.7)
+        for wish in _grips(body, arm, thing, handle):
+            reach = _to_bar(body, arm, wish, bar)
             if reach is None:
                 continue
             tried += 1
@@ -145,7 +171,18 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
             raise SkillFailure(FailureCode.OBSTRUCTED)
         return best
 
-    return explained(body, {arm: handle}, lid if part.spec.is_lid else search)
+    if not part.spec.is_lid:
+        return explained(body, {arm: handle}, search)
+    try:
+        return explained(body, {arm: handle}, whole_lid)
+    except SkillFailure as failure:
+        other_height = failure.code in (FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW)
+        if opening or thing.movable or other_height or body.hurried:
+            raise
+        try:
+            return lid(_PART_WAY)  # the lid of a fixture stays where it is left, and is taken again from there
+        except SkillFailure:
+            raise failure from None
 
 
 def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
@@ -156,7 +193,6 @@ def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
     """
     handle = body.world.handle(thing.object_id)
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
-    grip_m = body.spec.hand.tip_m - _PAST_BAR_M
 
     def search() -> Reach:
         if thing.moving[0].spec.is_lid:
@@ -164,8 +200,8 @@ def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
             if reach is not None:
                 return reach
             raise SkillFailure(FailureCode.OBSTRUCTED)
-        for pointing in _pointings(body, arm, handle):
-            reach = plan_reach(body, arm, HandPose(handle - grip_m * pointing, pointing), -pointing, 0.08, bar, pointing=0.7)
+        for wish in _grips(body, arm, thing, handle):
+            reach = _to_bar(body, arm, wish, bar)
             if reach is not None:
                 return reach
         raise SkillFailure(FailureCode.OBSTRUCTED)
@@ -194,7 +230,7 @@ def _plan_pull(body: Body, arm: Arm, part: MovingPart, reach: Reach, hand: Array
             postures.append(solved.q)
         count = len(postures)
         share = back * (count - 1) / (_WAYPOINTS - 1)
-        pull = Pull(reach, part, positions[:count], np.stack(postures), share)
+        pull = Pull(reach, part, positions[:count], np.stack(postures), share, 1.0, closed_on(body))
         if best is None or count > len(best.positions):
             best = pull
         if count == _WAYPOINTS:
@@ -218,16 +254,16 @@ def open_close(body: Body, action: Action, luck: Luck) -> Skill:
     for attempt in range(3 if not opening else 2):
         try:
             pull = assess_open_close(body, action)
+            if not outcome:
+                outcome = luck(action)
+            if isinstance(pull, Push):
+                yield from push_shut(body, action, pull, outcome)
+            else:
+                yield from _pull(body, action, pull, outcome)
         except SkillFailure:
             if attempt == 0:
                 raise
-            break
-        if not outcome:
-            outcome = luck(action)
-        if isinstance(pull, Push):
-            yield from push_shut(body, action, pull, outcome)
-        else:
-            yield from _pull(body, action, pull, outcome)
+            break  # what the first time has done counts
         if thing.held_by or _share(body, pull.part) >= _OPEN_WELL if opening else _share(body, pull.part) <= _CLOSED_MAX:
             return
     if opening and _share(body, thing.moving[0]) >= _OPEN_MIN:
@@ -289,8 +325,9 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
     if part.spec.is_lid:  # home over the lid: an arm that sags on its way would push a light object
         raised = body.vias(arm)[-1]
         yield from wait(0.1)  # clear of the lid, the hand can touch it again
-        if body.probe.free(arm, [raised]):
-            yield from body.move_arm(arm, [raised], speed=0.7)
+        way = route(body, arm, body.commanded_arm(arm), raised)
+        if way is not None or body.probe.free(arm, [raised]):
+            yield from body.move_arm(arm, [*(way or ()), raised], speed=0.7)
     yield from stow(body, arm)
 
 
@@ -313,21 +350,11 @@ def _lead(body: Body, arm: Arm, pull: Pull) -> Skill:
     """Moves hand and, where planned, base along the planned way."""
     base = body.commanded_base()
     ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
-    hinge = abs(float(pull.positions[-1] - pull.positions[0]))
-    length = hinge * 0.5 if pull.part.range[1] > 0.6 else hinge
+    length = pull.part.travel_m(float(pull.positions[-1] - pull.positions[0]))
     duration = 1.875 * max(length, 0.1) / (_LID_SPEED if pull.part.spec.is_lid else _SPEED)
-    shares = np.linspace(0.0, 1.0, len(pull.positions))
-    steps = max(2, round(duration / CONTROL_DT_S))
-    travelled = np.array([min_jerk(k / steps) for k in range(steps + 1)])
-    spots = base.position - pull.back_m * travelled[:, None] * ahead
-    way = np.column_stack([spots, np.full(steps + 1, base.yaw_rad)])
-    bases, legs = body.walking_targets(way)
-    for k in range(1, steps + 1):
-        body.command_arm(arm, np.array([np.interp(travelled[k], shares, column) for column in pull.postures.T]))
-        if pull.back_m > 0.0:
-            body.command_base(*map(float, bases[k]))
-            body.command_legs(legs[k])
-        yield
+    back = np.linspace(0.0, pull.back_m, len(pull.positions))[:, None] * ahead
+    stances = np.column_stack([base.position - back, np.full(len(back), base.yaw_rad)])
+    yield from sweep(body, arm, pull.postures, stances, duration)
     yield from wait(0.1)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Arm
-from sim.objects import MovingPart
+from sim.objects import MovingPart, ObjectInstance
 from sim.world import World
 
 if TYPE_CHECKING:
@@ -219,6 +219,30 @@ class ClearanceProbe:
     def free(self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str | int] = (), opening: float | None = None) -> bool:
         """Whether some arm postures at most touch what is around."""
         return bool(np.all(self.depths_m(arm, postures, ignore, opening, limit_m=TOUCH_M) <= TOUCH_M))
+
+    def load_depths_m(self, thing: ObjectInstance, poses: Iterable[Array]) -> Array:
+        """How deep a held object is in what is around at each of its poses (4, 4), world frame.
+
+        The robot and what lies in the object do not count.
+        """
+        world, scratch, model = self._world, self._scratch, self._world.model
+        scratch.qpos[:] = world.data.qpos
+        place, turn = slice(thing.qpos_adr, thing.qpos_adr + 3), slice(thing.qpos_adr + 3, thing.qpos_adr + 7)
+        load = np.isin(np.arange(model.ngeom), thing.geom_ids)
+        barred = ~np.isin(model.geom_bodyid, list(world.robot_body_ids))
+        for name in (thing.object_id, *world.contents(thing.object_id)):
+            barred[world.objects[name].geom_ids] = False
+        depths: list[float] = []
+        for pose in poses:
+            quaternion = np.empty(4)
+            mujoco.mju_mat2Quat(quaternion, pose[:3, :3].ravel())
+            scratch.qpos[place], scratch.qpos[turn] = pose[:3, 3], quaternion
+            mujoco.mj_kinematics(model, scratch)
+            mujoco.mj_collision(model, scratch)
+            a, b = scratch.contact.geom[: scratch.ncon].T
+            counts = (load[a] != load[b]) & barred[np.where(load[a], b, a)]
+            depths.append(max(0.0, float(-np.min(scratch.contact.dist[: scratch.ncon][counts], initial=0.0))))
+        return np.array(depths)
 
     def finger_gaps_m(self, arm: Arm, geoms: NDArray[np.int64]) -> tuple[float, float]:
         """Distance of each of the two opposing finger groups to some geoms, in the world as it is, negative inside."""

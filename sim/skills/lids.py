@@ -20,7 +20,7 @@ from sim.skills.body import Body
 from sim.skills.reach import Reach, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
 
-__all__ = ["Lead", "led_on", "plan_lead", "plan_tab"]
+__all__ = ["Lead", "closed_on", "led_on", "plan_lead", "plan_tab"]
 
 Array = NDArray[np.float64]
 
@@ -95,7 +95,12 @@ def _tab(body: Body) -> _Tab:
     hand = body.spec.hand
     if hand.pinch_m is not None:
         return _Tab((0.04, hand.pinch_m, 0.0), 0.5, 0.5)
-    return _Tab((hand.tip_m - _PAST_M, 0.0, 0.0), 1.0, 0.35)
+    return _Tab((hand.tip_m - _PAST_M, 0.0, 0.0), 1.0, closed_on(body))
+
+
+def closed_on(body: Body) -> float:
+    """Opening to which a hand closes on a bar or tab: five fingers hook it, two parallel ones press on it from both sides."""
+    return 0.35 if body.spec.hand.pinch_m is not None else 0.1
 
 
 def _closings(body: Body, pointing: Array) -> Iterator[Array]:

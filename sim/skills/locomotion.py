@@ -1,4 +1,4 @@
-"""Body skills: walk, turn, change pelvis height, go to an object.
+"""Body skills: walk, turn, change pelvis height, go to an object; and the base that moves along with an arm.
 
 The base follows collision-free paths as a disc, the feet step along (`sim.skills.gait`), and a hand that is pressed against
 something on the way stops the walk. Balance while walking is not simulated: the base is driven by servos, which the README
@@ -15,14 +15,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action
+from data.records import Action, Arm
 from sim.failures import FailureCode, SkillFailure
 from sim.navigation import NavigationMap, Stance, wrap_angle
 from sim.skills.body import Body
 from sim.skills.runner import CONTROL_DT_S, Skill
-from sim.trajectory import plan, plan_polyline
+from sim.trajectory import min_jerk, plan, plan_polyline
 
-__all__ = ["best_stance", "change_height", "go_to", "move", "rotate", "step_to"]
+__all__ = ["best_stance", "change_height", "go_to", "move", "rotate", "step_to", "sweep"]
 
 WALK_SPEED_M_S: Final = 0.9
 WALK_ACCELERATION_M_S2: Final = 2.0
@@ -160,6 +160,34 @@ def step_to(body: Body, path: NDArray[np.float64], yaw_rad: float) -> Skill:
         yield from _walk(body, path, along=False, limits=_PUSHED * (1.0, 1.0, 2.0))
     yield from _turn(body, yaw_rad)
     yield from _settle(body)
+
+
+def sweep(body: Body, arm: Arm, postures: NDArray[np.float64], stances: NDArray[np.float64], duration_s: float) -> Skill:
+    """Leads a hand along a way that arm, base and legs make together, from rest to rest.
+
+    Args:
+        body: the robot.
+        arm: whose hand it is.
+        postures: (N, A) arm joints along the way, evenly spaced.
+        stances: (N, 3) base poses (x, y, yaw) that go with them; base and legs stay as they are where these are all alike.
+        duration_s: time for the whole way.
+    """
+    steps = max(2, round(duration_s / CONTROL_DT_S))
+    shares = np.linspace(0.0, 1.0, len(postures))
+    travelled = np.array([min_jerk(k / steps) for k in range(steps + 1)])  # (T,)
+
+    def between(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.column_stack([np.interp(travelled, shares, column) for column in rows.T])  # (N, D) -> (T, D)
+
+    arms = between(postures)
+    walking = body.walking_targets(between(stances)) if bool(np.any(np.ptp(stances, axis=0) > 1e-6)) else None
+    for k in range(1, steps + 1):
+        body.command_arm(arm, arms[k])
+        if walking is not None:
+            bases, legs = walking
+            body.command_base(*map(float, bases[k]))
+            body.command_legs(legs[k])
+        yield
 
 
 def move(body: Body, action: Action) -> Skill:

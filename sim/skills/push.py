@@ -1,8 +1,9 @@
-"""Shutting a hinged door from outside: the fist goes to the door's outside face near its free edge and follows the arc.
+"""Shutting a door or drawer from outside: the fist goes to the outside face and follows its arc, or slides back with it.
 
 Nothing ties the hand to the door: contact alone moves it. An open door's outside face looks away from where a robot stands to
-use what is inside, so the plan may begin with a short step to another stance, and the base may walk along while the hand
-pushes. Stances are screened with the reach maps, the survivors are solved and checked for collisions.
+use what is inside, and a drawer's front is close to a robot that uses it, so the plan may begin with a short step to another
+stance, and the base may walk along while the hand pushes. Stances are screened with the reach maps, the survivors are solved
+and checked for collisions.
 
 Frames: world. The paper has no counterpart: Close is ours.
 """
@@ -23,13 +24,12 @@ from sim.objects import MovingPart, ObjectInstance
 from sim.skills.body import ArmGoal, Body, wait
 from sim.skills.clearance import TOUCH_M
 from sim.skills.door import Door
-from sim.skills.locomotion import step_to
+from sim.skills.locomotion import step_to, sweep
 from sim.skills.manipulate import GRASP_GAP_M, stow
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach import Reach, route
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import CONTROL_DT_S, Skill
-from sim.trajectory import min_jerk
+from sim.skills.runner import Skill
 
 __all__ = ["Push", "plan_push", "push_shut"]
 
@@ -37,9 +37,10 @@ Array = NDArray[np.float64]
 
 #: How far past shut the hand is led, share of the joint's range: the door is pressed against its stop.
 _PAST_SHUT: Final = 0.04
-#: Largest turn of the door between two waypoints.
-_STEP_RAD: Final = 0.16
-#: Where the fist may touch: shares of the way from hinge to free edge, and heights relative to the shoulder.
+#: Largest way of the door between two waypoints, as `MovingPart.travel_m` gives it.
+_STEP_M: Final = 0.08
+#: Where the fist may touch: shares of the way from hinge to free edge, and heights relative to the shoulder. Of a drawer, whose
+#: ends are both free, the end on the arm's own side comes first.
 _SPOTS: Final = ((0.88, -0.22), (0.72, -0.22), (0.88, -0.4), (0.88, -0.05), (0.58, -0.22), (0.72, -0.4))
 #: Half the width of a fist, with some room.
 _FIST_HALF_M: Final = 0.075
@@ -50,7 +51,7 @@ _PRESS_SLACK_M: Final = 0.006
 _FIST_M: Final = 0.05
 _BEFORE_M: Final = 0.1
 #: Longest way to the stance from which the door is pushed, and longest way along with the door.
-_STEP_M: Final = 1.3
+_WALK_M: Final = 1.3
 _ALONG_M: Final = 0.7
 _ALONG_RAD: Final = 1.2
 #: Half size and spacing of the grid of stances around the hinge.
@@ -71,11 +72,11 @@ _TRIALS_EXPLAINING: Final = 4
 _HAND_ROOM_M: Final = 0.004
 #: The same for a hand behind the door: its fingers would hook the door as they close.
 _FINGERS_M: Final = 0.035
-#: Turn of the door from which on the fist has met it.
-_NUDGED_RAD: Final = 0.02
-#: Turn of the door in the step before the push from which on the plan does not hold any more.
-_TAKEN_ALONG_RAD: Final = 0.15
-#: Peak speed of the free edge, m/s.
+#: Way of the door from which on the fist has met it.
+_NUDGED_M: Final = 0.01
+#: Way of the door in the step before the push from which on the plan does not hold any more.
+_TAKEN_ALONG_M: Final = 0.075
+#: Peak speed of the free edge or drawer, m/s.
 _EDGE_SPEED: Final = 0.4
 #: How much deeper than in its push a fist may come to a door while it is drawn back.
 _CATCH_M: Final = 0.004
@@ -118,11 +119,10 @@ def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> 
     door = Door.of(body, thing, part)
     low, high = part.range
     goal = low - _PAST_SHUT * (high - low)
-    count = 2 + int(np.ceil(abs(door.now - goal) / _STEP_RAD))
+    count = 2 + int(np.ceil(part.travel_m(door.now - goal) / _STEP_M))
     positions = np.linspace(door.now, goal, count)
-    shoulder_m = float(body.shoulder(arm)[2])
     trials = _TRIALS if body.considered_height_m is None else _TRIALS_EXPLAINING
-    for spot in _spots(body, door, shoulder_m):
+    for spot in _spots(body, arm, door, thing):
         for stances in _stances(body, arm, door, spot, positions)[:_SOLVED]:
             if trials == 0:
                 return None
@@ -133,22 +133,31 @@ def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> 
     return None
 
 
-def _spots(body: Body, door: Door, shoulder_m: float) -> list[tuple[float, float]]:
+def _spots(body: Body, arm: Arm, door: Door, thing: ObjectInstance) -> list[tuple[float, float]]:
     """Where the fist may touch, as distances from the hinge and heights: beside the handle first, which would catch it."""
     model, data = body.world.model, body.world.data
+    shoulder_m = float(body.shoulder(arm)[2])
     low, high = door.heights
     clear: list[tuple[float, float]] = []
     at_handle: list[tuple[float, float]] = []
-    handle = data.site_xpos[door.part.handle_site] if door.part.handle_site >= 0 else None
-    geoms = np.flatnonzero((model.geom_bodyid == door.part.body_id) & (model.geom_contype > 0))
-    half_m = min((float(model.geom_aabb[geom, 5]) for geom in geoms), default=0.0)  # the handle is lower than the panel
+    along_m, handle_z = np.inf, np.inf
+    if door.part.handle_site >= 0:
+        handle = data.site_xpos[door.part.handle_site]
+        along_m, handle_z = float((handle - door.hinge(door.now)) @ door.along(door.now)), float(handle[2])
+    long_m = high_m = 0.0  # half the handle's extent along the door and upwards, in excess of its thickness
+    for geom in body.part_geoms(thing, "handle"):
+        half, axes = model.geom_aabb[geom, 3:], data.geom_xmat[geom].reshape(3, 3)
+        long_m = max(long_m, float(np.abs(door.along(door.now) @ axes) @ half - np.min(half)))
+        high_m = max(high_m, float(np.abs(axes[2]) @ half - np.min(half)))
     for share, rise in _SPOTS:
-        spot = (share * door.width_m, float(np.clip(shoulder_m + rise, low + 0.06, high - 0.06)))
-        beside = handle is None or abs(float((handle - door.anchor) @ door.along(door.now)) - spot[0]) > _FIST_HALF_M
-        above = handle is None or abs(float(handle[2]) - spot[1]) > half_m + _FIST_HALF_M
-        rank = clear if beside or above else at_handle
-        if spot not in clear and spot not in at_handle:
-            rank.append(spot)
+        height = float(np.clip(shoulder_m + rise, low + 0.06, high - 0.06))
+        ends = (share,) if not door.slides else (1.0 - share, share) if arm is Arm.LEFT else (share, 1.0 - share)
+        for end in ends:
+            spot = (end * door.width_m, height)
+            beside, above = abs(along_m - spot[0]) > long_m + _FIST_HALF_M, abs(handle_z - height) > high_m + _FIST_HALF_M
+            rank = clear if beside or above else at_handle
+            if spot not in clear and spot not in at_handle:
+                rank.append(spot)
     return clear + at_handle
 
 
@@ -165,7 +174,7 @@ def _stances(body: Body, arm: Arm, door: Door, spot: tuple[float, float], positi
     here = np.zeros(len(first), dtype=bool)
     here[0] = True
     ways = np.where(here, 0.0, ways)
-    keep = (here | (nav.clearance(first[:, :2]) >= 0.0)) & (ways <= _STEP_M)
+    keep = (here | (nav.clearance(first[:, :2]) >= 0.0)) & (ways <= _WALK_M)
     first, ways = first[keep], ways[keep]
     turn = np.abs(_wrapped(first[:, 2] - base.yaw_rad))
     strain = _strain(body, arm, first, np.broadcast_to(sites[0], (len(first), 3)))
@@ -215,7 +224,7 @@ def _grid(door: Door, base: Stance, site: Array) -> Array:
     """(M, 3) base poses around a door that face the point of contact, the present one first."""
     steps = np.arange(-_GRID_M, _GRID_M + 1e-9, _SPACING_M)
     u, v = (axis.ravel() for axis in np.meshgrid(steps, steps))
-    spots = door.anchor[:2] + u[:, None] * door.side[:2] + v[:, None] * door.front[:2]
+    spots = door.hinge(door.now)[:2] + u[:, None] * door.side[:2] + v[:, None] * door.front[:2]
     spots = spots[np.hypot(*(spots - site[:2]).T) < 0.95]
     bearing = np.arctan2(site[1] - spots[:, 1], site[0] - spots[:, 0])
     poses = [np.column_stack([spots, _wrapped(bearing + off)]) for off in _BEARINGS]
@@ -248,12 +257,12 @@ def _shoulders(body: Body, arm: Arm, poses: Array) -> Array:
 
 def _behind(body: Body, arm: Arm, door: Door, poses: Array, site: Array, position: float) -> NDArray[np.bool_]:
     """(M,) whether the straight line from shoulder to hand would pass through the door."""
-    shoulders = _shoulders(body, arm, poses) - door.anchor
+    shoulders = _shoulders(body, arm, poses) - door.hinge(position)
     out = shoulders @ door.normal(position) - door.face_m
     along = shoulders @ door.along(position)
-    hand = float((site - door.anchor) @ door.along(position))
+    hand = float((site - door.hinge(position)) @ door.along(position))
     crossing = hand + (along - hand) * _FIST_M / np.maximum(_FIST_M - out, 1e-6)
-    return (out < 0.0) & (crossing < door.width_m + 0.02)
+    return (out < 0.0) & (crossing < door.width_m + 0.02) & (crossing > -0.02 if door.slides else True)
 
 
 def _best(poses: Array, cost: Array) -> tuple[Array, Array]:
@@ -424,7 +433,7 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
     assert arm is not None and action.object_id is not None
     if push.way is not None:
         yield from step_to(body, push.way, float(push.stances[0, 2]))
-        if abs(float(body.world.data.qpos[part.qpos_adr]) - float(push.positions[0])) > _TAKEN_ALONG_RAD:
+        if part.travel_m(float(body.world.data.qpos[part.qpos_adr] - push.positions[0])) > _TAKEN_ALONG_M:
             return
     yield from body.move_hand(arm, 0.0, 0.2)
     yield from body.move_arm(arm, [*push.reach.way, push.reach.before])
@@ -432,8 +441,8 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
     yield from wait(0.1)
     panel = np.flatnonzero(body.world.model.geom_bodyid == part.body_id)
     gap = body.probe.limb_gap_m(arm, panel)
-    moved = abs(float(body.world.data.qpos[part.qpos_adr]) - float(push.positions[0]))
-    if gap > GRASP_GAP_M and moved < _NUDGED_RAD:
+    moved = part.travel_m(float(body.world.data.qpos[part.qpos_adr] - push.positions[0]))
+    if gap > GRASP_GAP_M and moved < _NUDGED_M:
         yield from _draw_back(body, arm, push.reach.before[None])
         raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": gap})
     if outcome != "success":
@@ -441,18 +450,9 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
         yield from _draw_back(body, arm, push.reach.before[None])
         code = FailureCode.LOCKED if outcome == "locked" else FailureCode.NOTHING_HAPPENED
         raise SkillFailure(code, contingency=outcome)
-    shares = np.linspace(0.0, 1.0, len(push.positions))
     stances = push.stances + (0.0, 0.0, body.commanded_base().yaw_rad - push.stances[0, 2])  # the same turn of the heading
-    turn = abs(float(push.positions[-1] - push.positions[0]))
-    steps = max(2, round(1.875 * max(0.5 * turn, 0.1) / _EDGE_SPEED / CONTROL_DT_S))
-    ways = np.array([min_jerk(k / steps) for k in range(steps + 1)])
-    way = np.column_stack([np.interp(ways, shares, column) for column in stances.T])
-    bases, legs = body.walking_targets(way)
-    for k in range(1, steps + 1):
-        body.command_arm(arm, np.array([np.interp(ways[k], shares, column) for column in push.postures.T]))
-        body.command_base(*map(float, bases[k]))
-        body.command_legs(legs[k])
-        yield
+    length = part.travel_m(float(push.positions[-1] - push.positions[0]))
+    yield from sweep(body, arm, push.postures, stances, 1.875 * max(length, 0.1) / _EDGE_SPEED)
     yield from wait(0.2)
     yield from _draw_back(body, arm, push.away)
 

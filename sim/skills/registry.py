@@ -7,7 +7,7 @@ from typing import Final
 
 from data.records import Action, PlanStep
 from sim.failures import FailureCode, SkillFailure
-from sim.skills import articulate, holding, locomotion, manipulate, pouring, tools, two_arm
+from sim.skills import articulate, holding, locomotion, manipulate, pouring, set_down, tools, two_arm
 from sim.skills.body import Body
 from sim.skills.manipulate import Luck
 from sim.skills.push import Push
@@ -45,7 +45,7 @@ ARM_SKILLS: Final[Mapping[str, Callable[[Body, Action, Luck], Skill]]] = {
     "Pour": pouring.pour,
     "Fill": pouring.fill,
     "Lift": two_arm.lift,
-    "PlaceBoth": two_arm.place_both,
+    "PlaceBoth": set_down.place_both,
 }
 
 
@@ -117,7 +117,7 @@ def assess_action(body: Body, action: Action, known: frozenset[str]) -> SkillFai
         "Pour": pouring.assess_pour,
         "Fill": pouring.assess_fill,
         "Lift": two_arm.assess_lift,
-        "PlaceBoth": two_arm.assess_place_both,
+        "PlaceBoth": set_down.assess_place_both,
     }
     if action.name not in planners:
         return None

@@ -1,4 +1,4 @@
-"""Lift and PlaceBoth: both hands press on opposite sides of an object, raise it and put it down together.
+"""Lift: both hands press on opposite sides of an object and raise it; `sim.skills.set_down` puts it down.
 
 Both arms (and the waist, where the robot's solver owns it) are one inverse-kinematics problem here. The lift holds only when
 both hands touch the object. Paper: dual-arm essential tasks.
@@ -18,7 +18,7 @@ from sim.failures import FailureCode, SkillFailure
 from sim.liquids import spill
 from sim.objects import ObjectInstance
 from sim.skills.body import Body, BothGoal, wait
-from sim.skills.checks import check_lift, check_place_both
+from sim.skills.checks import check_lift
 from sim.skills.grasps import solid_box
 from sim.skills.manipulate import GRASP_GAP_M, Luck
 from sim.skills.reach import blame, route
@@ -26,12 +26,12 @@ from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
 
-__all__ = ["assess_lift", "assess_place_both", "lift", "place_both"]
+__all__ = ["BOTH_TOLERANCE_M", "MOST_SAG_M", "SAG_M", "assess_lift", "hands_m", "lift", "shifted"]
 
 Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _APART_M: Final = 0.125
-_TOLERANCE_M: Final = 0.02
+BOTH_TOLERANCE_M: Final = 0.02
 #: How far an object has to come up to be lifted, and how far the first, straight part of the lift goes.
 _RISE_M: Final = 0.08
 _FIRST_M: Final = 0.05
@@ -39,7 +39,8 @@ _FIRST_M: Final = 0.05
 _HOLDS: Final = ((0.3, 0.2), (0.3, 0.12), (0.3, 0.05), (0.25, 0.2), (0.25, 0.1), (0.2, 0.06), (0.2, 0.0),
                  (0.15, 0.05), (0.15, 0.0), (0.12, 0.0), (0.08, 0.0))  # fmt: skip
 #: Sagging of what is held that is made up for.
-_SAG_M: Final = 0.015
+SAG_M: Final = 0.015
+MOST_SAG_M: Final = 0.06
 #: Radians of tilt that a metre of height is worth when one of them is chosen.
 _HEIGHT_WEIGHT: Final = 2.4
 
@@ -102,10 +103,10 @@ def assess_lift(body: Body, action: Action) -> BothReach:
     def search() -> BothReach:
         before = _goal(body, sides, _APART_M, None)
         at = _goal(body, sides, 0.004, before.arms)
-        if before.error_m > _TOLERANCE_M or at.error_m > _TOLERANCE_M:
+        if before.error_m > BOTH_TOLERANCE_M or at.error_m > BOTH_TOLERANCE_M:
             raise SkillFailure(FailureCode.OBSTRUCTED)
         risen = {arm: (point + _RISE_M * _UP, normal) for arm, (point, normal) in sides.items()}
-        if _goal(body, risen, 0.004, at.arms).error_m > _TOLERANCE_M:  # taken, but not got off what carries it
+        if _goal(body, risen, 0.004, at.arms).error_m > BOTH_TOLERANCE_M:  # taken, but not got off what carries it
             raise SkillFailure(FailureCode.OBSTRUCTED)
         for arm in Arm:
             if not (body.probe.free(arm, [before.arms[arm]], opening=1.0) and body.probe.free(arm, [at.arms[arm]], name, 1.0)):
@@ -151,7 +152,7 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
     outcome = luck(action)
     for arm in Arm:
         body.world.attach(arm.value, thing.object_id)
-    first = _shifted(body, _FIRST_M, 0.0)
+    first = shifted(body, _FIRST_M, 0.0)
     yield from body.move_both([first], speed=0.5)
     if outcome != "success":
         for arm in Arm:
@@ -162,17 +163,17 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
         yield from body.stow_both()
         code = FailureCode.SPILLED if outcome == "spilled" else FailureCode.SLIPPED
         raise SkillFailure(code, contingency=outcome)
-    options = [(up, _shifted(body, up, back)) for up, back in _HOLDS]
-    options = [(up, goal) for up, goal in options if goal.error_m <= _TOLERANCE_M]
+    options = [(up, shifted(body, up, back)) for up, back in _HOLDS]
+    options = [(up, goal) for up, goal in options if goal.error_m <= BOTH_TOLERANCE_M]
     if options:
-        before_m = _hands_m(body)
+        before_m = hands_m(body)
         up, hold = min(options, key=lambda option: option[1].tilt_rad - _HEIGHT_WEIGHT * option[0])
         yield from body.move_both([hold], speed=0.5)
         yield from wait(0.1)
-        sag_m = before_m + up - _hands_m(body)
-        if sag_m > _SAG_M:  # the servos give way under the load
-            higher = _shifted(body, 2.0 * min(sag_m, 0.06), 0.0)
-            if higher.error_m <= _TOLERANCE_M:
+        sag_m = before_m + up - hands_m(body)
+        if sag_m > SAG_M:  # the servos give way under the load
+            higher = shifted(body, 2.0 * min(sag_m, MOST_SAG_M), 0.0)
+            if higher.error_m <= BOTH_TOLERANCE_M:
                 yield from body.move_both([higher], speed=0.5)
     yield from wait(0.1)
     if body.lifted != thing.object_id or thing.object_id in body.world.all_parents():
@@ -184,7 +185,7 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
         raise SkillFailure(FailureCode.DROPPED)
 
 
-def _hands_m(body: Body) -> float:
+def hands_m(body: Body) -> float:
     """Mean height of both hands as they are, metres."""
     return float(np.mean([body.hand_pose(arm)[0][2] for arm in Arm]))
 
@@ -204,7 +205,7 @@ def _press(body: Body, reach: BothReach, thing: ObjectInstance) -> Skill:
         yield
 
 
-def _shifted(body: Body, up_m: float, back_m: float) -> BothGoal:
+def shifted(body: Body, up_m: float, back_m: float) -> BothGoal:
     """Both hands moved by the same displacement, their orientation kept."""
     move = up_m * _UP - back_m * body.turn_to_world(np.array([1.0, 0.0, 0.0]))
     wishes = {}
@@ -212,80 +213,3 @@ def _shifted(body: Body, up_m: float, back_m: float) -> BothGoal:
         position, hand = body.hand_pose(arm)
         wishes[arm] = HandPose(position + move, hand[:, 0], hand[:, 1])
     return body.solve_both(wishes, body.commanded_both())
-
-
-@remembered
-def assess_place_both(body: Body, action: Action) -> tuple[BothGoal, BothGoal]:
-    """What PlaceBoth would do: hands above the spot, and at it.
-
-    Raises:
-        SkillFailure: as PlaceBoth would before it moves.
-    """
-    assert action.object_id is not None
-    receptacle = body.thing(action.object_id)
-    thing = check_place_both(body, receptacle)
-    spots = body.free_spots(thing, receptacle, None)
-    if not spots:
-        raise SkillFailure(FailureCode.RECEPTACLE_FULL)
-    low, _ = body.world.bounds(thing.object_id)
-    origin = body.world.pose(thing.object_id)[:3, 3]
-    hands = {arm: body.hand_pose(arm) for arm in Arm}
-
-    def moves() -> list[Array]:
-        return [spot - origin + (0.0, 0.0, origin[2] - low[2] + 0.004) for spot in spots]
-
-    def search() -> tuple[BothGoal, BothGoal]:
-        for move in moves():
-            at_wish = {arm: HandPose(p + move, r[:, 0], r[:, 1]) for arm, (p, r) in hands.items()}
-            above = {arm: HandPose(p + move + 0.07 * _UP, r[:, 0], r[:, 1]) for arm, (p, r) in hands.items()}
-            at = body.solve_both(at_wish, body.commanded_both())
-            before = body.solve_both(above, at.arms)
-            if at.error_m <= _TOLERANCE_M and before.error_m <= 1.5 * _TOLERANCE_M:
-                return before, at
-        raise SkillFailure(FailureCode.OBSTRUCTED)
-
-    try:
-        return search()
-    except SkillFailure:
-        raise blame(body, {arm: p + moves()[0] for arm, (p, _) in hands.items()}, search) from None
-
-
-def place_both(body: Body, action: Action, luck: Luck) -> Skill:
-    """PlaceBoth: puts down what both hands hold.
-
-    Raises:
-        SkillFailure: what `assess_place_both` refuses, PlaceMissed, or a contingency.
-    """
-    before, at = assess_place_both(body, action)
-    assert action.object_id is not None
-    thing, receptacle = body.thing(body.lifted or ""), body.thing(action.object_id)
-    hold, waist = body.commanded_both(), body.commanded_waist()
-    rise = max(0.0, float(body.hand_height(before) - body.hand_height(BothGoal(hold, waist, 0.0))))
-    raised = _shifted(body, rise + 0.02, 0.0)  # straight up first, over the receptacle's edge
-    yield from body.move_both([raised, before] if raised.error_m <= _TOLERANCE_M else [before], speed=0.6)
-    outcome = luck(action)
-    if outcome != "success":
-        yield from body.move_both([BothGoal(hold, waist, 0.0)], speed=0.6)
-        raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
-    for _ in body.move_both([at], speed=0.4):
-        yield
-        if body.rests(thing):
-            break
-    yield from wait(0.1)
-    for arm in Arm:
-        body.world.detach(arm.value)
-    wishes = {}
-    outward = body.turn_to_world(np.array([0.0, 1.0, 0.0]))
-    for arm, sign in ((Arm.LEFT, 1.0), (Arm.RIGHT, -1.0)):
-        position, hand = body.hand_pose(arm)
-        wishes[arm] = HandPose(position + sign * 0.09 * outward + 0.01 * _UP, hand[:, 0], hand[:, 1])
-    apart = body.solve_both(wishes, body.commanded_both())
-    yield from body.move_both([apart], speed=0.6)
-    yield from body.stow_both()
-    for _ in range(int(0.6 / CONTROL_DT_S)):
-        if body.world.speed_of(thing.object_id) < 0.02:
-            break
-        yield
-    if receptacle.object_id not in body.world.parents(thing.object_id):
-        gap = float(np.linalg.norm(body.world_position(thing.object_id) - body.world_position(receptacle.object_id)))
-        raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})

@@ -11,6 +11,7 @@ import pytest
 
 from data.records import EpisodeRecord, FailureCategory, Outcome
 from proprio_mllm.evaluation.ledger import Ledger
+from tests.report.ledgers import scripted_run
 
 CATEGORIES = ("single", "optional", "essential")
 
@@ -87,3 +88,9 @@ def record() -> Callable[..., EpisodeRecord]:
 @pytest.fixture
 def run() -> Callable[..., Path]:
     return make_run
+
+
+@pytest.fixture(scope="session")
+def acted_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run in the simulator: what a model wrote is hostile, then the body is too low for the plant, then it is lifted."""
+    return scripted_run(tmp_path_factory.mktemp("acted"))

@@ -13,6 +13,7 @@ from sim.skills.body import Body
 from sim.skills.push import Push
 from sim.skills.remembered import remembered
 from sim.skills.runner import refuse, run_skills
+from sim.skills.set_down import assess_place_both
 from sim.world import World
 
 THINGS = (
@@ -251,6 +252,31 @@ def test_two_hands_lift_a_box():
     assert act(made, "ResetArm(left)")[0].code == "BothHandsBusy"
     assert reach(made, "PlaceBoth(Desk_1)").success
     assert "Desk_1" in made.world.parents("Box_1")
+    made.close()
+
+
+@pytest.mark.parametrize("robot", ["h1", "x1"])
+def test_a_load_that_is_carried_low_comes_up_before_the_desk(robot):
+    """The arms raise it over the edge, or say how much higher the pelvis has to be; it never meets the desk's front."""
+    made = Session(robot, image_size=0)
+    plant = ObjectPlacement("HousePlant_1", "CoffeeTable_1", (-0.08, -0.9))
+    start(made, FreePlay("living_room_1", placements=(plant,)))
+    assert reach(made, "Lift(HousePlant_1)").success
+    top = 0.8
+    act(made, "GoTo(Desk_1)")
+    assert made.world.bounds("HousePlant_1")[0][2] < top
+    action, verdicts = Action.parse("PlaceBoth(Desk_1)"), []
+    for _ in range(4):
+        verdicts.append(made.assess(action))
+        if verdicts[-1] is None:
+            break
+        assert verdicts[-1].code is FailureCode.BODY_TOO_LOW and verdicts[-1].margins["height_m"] > 0.0
+        act(made, f"MoveUp({max(verdicts[-1].margins['height_m'], 0.03):.2f})")
+    assert verdicts[-1] is None
+    plan = assess_place_both(made.body, action)
+    assert plan.raised is not None and plan.surface_m == pytest.approx(top, abs=0.01)
+    assert act(made, "PlaceBoth(Desk_1)")[0].success
+    assert "Desk_1" in made.world.parents("HousePlant_1")
     made.close()
 
 

@@ -1,0 +1,278 @@
+"""PlaceBoth: both hands bring what they hold over the edge of a receptacle and put it down.
+
+A load that is carried lower than the receptacle's top comes straight up first, then passes over the edge, then comes down. How
+high it passes, and past what, is asked of a copy of the simulator's state; where the arms do not raise it as far, another
+pelvis height is asked for. Paper: dual-arm essential tasks.
+
+World frame, metres, radians; poses are (4, 4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.records import Action, Arm
+from sim.failures import FailureCode, SkillFailure
+from sim.objects import ObjectInstance
+from sim.skills.body import Body, BothGoal, wait
+from sim.skills.checks import check_place_both
+from sim.skills.clearance import TOUCH_M
+from sim.skills.manipulate import Luck
+from sim.skills.reach import blame
+from sim.skills.reach_map import HandPose
+from sim.skills.remembered import remembered
+from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.skills.two_arm import BOTH_TOLERANCE_M, MOST_SAG_M, SAG_M, hands_m, shifted
+
+__all__ = ["BothPlacement", "assess_place_both", "place_both"]
+
+Array = NDArray[np.float64]
+_UP: Final = np.array([0.0, 0.0, 1.0])
+#: Heights above its spot at which a load passes over the receptacle's edge, tried in turn, and the least of it that counts as
+#: over the edge already.
+_OVER_M: Final = (0.07, 0.15, 0.25)
+_EDGE_M: Final = 0.03
+#: How much higher it is raised than that, tried in turn: a load that leans reaches farther down.
+_EXTRA_M: Final = (0.02, 0.08, -0.02)
+#: How much a load may lean more than it is meant to while it is raised, and lean when it is put down as it is held.
+_LEANING_RAD: Final = 0.5
+#: How deep a load may run into what is on its way over the receptacle.
+_SHOVE_M: Final = 0.03
+#: Distance between the places of a load that are asked on its way.
+_SWEEP_M: Final = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class BothPlacement:
+    """A motion of both hands with a load: straight up, above the spot, and at it.
+
+    Attributes:
+        surface_m: height of the spot.
+        raised: the load high enough to pass over the receptacle's edge; None where it is already and the arms do not go higher.
+        above: over the spot.
+        at: on the spot.
+    """
+
+    surface_m: float
+    raised: BothGoal | None
+    above: BothGoal
+    at: BothGoal
+
+
+@remembered
+def assess_place_both(body: Body, action: Action) -> BothPlacement:
+    """What PlaceBoth would do.
+
+    Raises:
+        SkillFailure: as PlaceBoth would before it moves.
+    """
+    assert action.object_id is not None
+    receptacle = body.thing(action.object_id)
+    thing = check_place_both(body, receptacle)
+    spots = body.free_spots(thing, receptacle, None)
+    if not spots:
+        raise SkillFailure(FailureCode.RECEPTACLE_FULL)
+    load = _Load.of(body, thing)
+    heights = [_height_over(body, load, spot) for spot in spots]
+    carried_m = body.hand_height(_hold(body))
+
+    def search() -> BothPlacement:
+        higher_m = body.hand_height(_hold(body)) - carried_m  # the load comes along with the pelvis
+        for spot, over_m in zip(spots, heights, strict=True):
+            if over_m is None:
+                continue
+            at = body.solve_both(load.hands(load.above(spot + 0.004 * _UP)), body.commanded_both())
+            above = body.solve_both(load.hands(load.above(spot + over_m * _UP)), at.arms)
+            over = load.bottom_m + higher_m > spot[2] + _EDGE_M
+            if at.error_m > BOTH_TOLERANCE_M or above.error_m > 1.5 * BOTH_TOLERANCE_M:
+                continue
+            if load.sunk_m(above.tilt_rad) > over_m:  # it would lean into the edge
+                continue
+            level_m = float(spot[2]) + over_m
+            raised = _raised(body, load, level_m, higher_m, np.inf if over else _LEANING_RAD)
+            if over or raised is not None:
+                return BothPlacement(float(spot[2]), raised, above, at)
+        raise SkillFailure(FailureCode.OBSTRUCTED)
+
+    try:
+        return search()
+    except SkillFailure:
+        way = load.above(spots[0])[:3, 3] - load.turned[:3, 3]
+        raise blame(body, {arm: body.hand_pose(arm)[0] + way for arm in Arm}, search) from None
+
+
+def _hold(body: Body) -> BothGoal:
+    """The posture that is commanded."""
+    return BothGoal(body.commanded_both(), body.commanded_waist(), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Load:
+    """What both hands hold, moved with them as one rigid piece; poses are (4, 4), world frame.
+
+    Attributes:
+        thing: the object.
+        pose: where it is.
+        turned: as it is put down: as it is, or turned upright between the hands where it leans too much for that.
+        grasps: per arm the hand in the object's frame.
+        sole_m: how far its lowest point is below its origin as it is put down.
+        bottom_m: height of its lowest point now.
+    """
+
+    thing: ObjectInstance
+    pose: Array
+    turned: Array
+    grasps: Mapping[Arm, Array]
+    sole_m: float
+    bottom_m: float
+
+    @classmethod
+    def of(cls, body: Body, thing: ObjectInstance) -> _Load:
+        """What is held now."""
+        pose = body.world.pose(thing.object_id)
+        hands = {arm: _pose(*body.hand_pose(arm)) for arm in Arm}
+        bottom_m = float(body.world.bounds(thing.object_id)[0][2])
+        turned, sole_m = pose, float(pose[2, 3]) - bottom_m
+        if float(np.arccos(np.clip(pose[2, 2], -1.0, 1.0))) > _LEANING_RAD:
+            middle = 0.5 * (hands[Arm.LEFT][:3, 3] + hands[Arm.RIGHT][:3, 3])
+            turn = _uprighting(pose[:3, 2])
+            turned = _pose(middle + turn @ (pose[:3, 3] - middle), turn @ pose[:3, :3])
+            sole_m = -float(thing.local_min[2])
+        return cls(thing, pose, turned, {arm: np.linalg.inv(pose) @ hand for arm, hand in hands.items()}, sole_m, bottom_m)
+
+    def hands(self, pose: Array) -> dict[Arm, HandPose]:
+        """Where the hands are when the object is at a pose."""
+        found = {arm: pose @ grasp for arm, grasp in self.grasps.items()}
+        return {arm: HandPose(hand[:3, 3], hand[:3, 0], hand[:3, 1]) for arm, hand in found.items()}
+
+    def above(self, point: Array) -> Array:
+        """The object's pose with its lowest point at the height of a point (3,) and its origin over it."""
+        return _pose(point + self.sole_m * _UP, self.turned[:3, :3])
+
+    def sunk_m(self, tilt_rad: float) -> float:
+        """How much lower its lowest point is when it leans ahead or back between the hands."""
+        held_m = float(np.mean([grasp[2, 3] for grasp in self.grasps.values()])) - float(self.thing.local_min[2])
+        depth_m = float(np.min((self.thing.local_max - self.thing.local_min)[:2]))
+        return max(0.0, 0.5 * depth_m * float(np.sin(tilt_rad)) - held_m * (1.0 - float(np.cos(tilt_rad))))
+
+
+def _pose(position: Array, rotation: Array) -> Array:
+    """(4, 4) of a position and a rotation."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, position
+    return pose
+
+
+def _uprighting(up: Array) -> Array:
+    """(3, 3) smallest rotation that turns a unit direction up; none for one that points down."""
+    x, y, z = map(float, up)
+    if z < 0.0:
+        return np.eye(3)
+    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1.0 + z)
+
+
+def _raised(body: Body, load: _Load, level_m: float, higher_m: float, lean_rad: float) -> BothGoal | None:
+    """Both hands straight up until a load's lowest point is at a level, None where the arms cannot, or tilt it too much.
+
+    Args:
+        body: the robot.
+        load: what the hands hold.
+        level_m: where the lowest point has to be, world frame.
+        higher_m: how much higher the load comes with the pelvis height under consideration.
+        lean_rad: how much it may lean more than it is meant to; without a bound nothing depends on the raise.
+    """
+    present_m = float(load.turned[2, 3]) - load.sole_m + higher_m
+    for extra_m in _EXTRA_M:
+        bottom_m = max(level_m, present_m) + extra_m
+        goal = body.solve_both(load.hands(load.above(np.array([*load.turned[:2, 3], bottom_m]))), body.commanded_both())
+        if goal.error_m > BOTH_TOLERANCE_M or goal.tilt_rad > lean_rad:
+            continue
+        if np.isinf(lean_rad) or bottom_m - load.sunk_m(goal.tilt_rad) >= level_m - _EDGE_M:
+            return goal
+    return None
+
+
+def _height_over(body: Body, load: _Load, spot: Array) -> float | None:
+    """How high above a spot the load passes over what is before it, None where there is something on every way."""
+    for over_m in _OVER_M:
+        end = load.above(spot + over_m * _UP)
+        top, start = load.turned.copy(), load.pose.copy()
+        top[2, 3] = max(end[2, 3], top[2, 3])
+        start[2, 3] += top[2, 3] - load.turned[2, 3]
+        up = body.probe.load_depths_m(load.thing, _between(load.pose, start))
+        across = body.probe.load_depths_m(load.thing, _between(top, end))
+        if max(up) <= max(up[0], TOUCH_M) and max(across) <= _SHOVE_M:
+            return over_m
+    return None
+
+
+def _between(start: Array, end: Array) -> list[Array]:
+    """Poses (4, 4) on a straight line, a few centimetres apart, turned like the start."""
+    way = end[:3, 3] - start[:3, 3]
+    count = 2 + int(np.linalg.norm(way) / _SWEEP_M)
+    return [_pose(start[:3, 3] + share * way, start[:3, :3]) for share in np.linspace(0.0, 1.0, count)]
+
+
+def _under_m(body: Body, thing: ObjectInstance, placement: BothPlacement) -> float:
+    """How far a load's lowest point is below the surface that it is brought to, negative above it."""
+    return placement.surface_m - float(body.world.bounds(thing.object_id)[0][2])
+
+
+def place_both(body: Body, action: Action, luck: Luck) -> Skill:
+    """PlaceBoth: puts down what both hands hold, straight up first and then over the receptacle's edge.
+
+    Raises:
+        SkillFailure: what `assess_place_both` refuses, BodyTooLow where the arms give way below the edge, PlaceMissed, or a
+            contingency.
+    """
+    placement = assess_place_both(body, action)
+    assert action.object_id is not None
+    thing, receptacle = body.thing(body.lifted or ""), body.thing(action.object_id)
+    hold, first = _hold(body), []
+    if placement.raised is not None:
+        first = [placement.raised]
+        yield from body.move_both(first, speed=0.6)
+        yield from wait(0.1)
+        if _under_m(body, thing, placement) > -_EDGE_M:  # the servos give way under the load
+            sag_m = max(body.hand_height(placement.raised) - hands_m(body), 0.0)
+            higher = shifted(body, 2.0 * min(sag_m, MOST_SAG_M), 0.0)
+            if sag_m > SAG_M and higher.error_m <= BOTH_TOLERANCE_M:
+                first = [higher]
+                yield from body.move_both(first, speed=0.5)
+        under_m = _under_m(body, thing, placement)
+        if under_m > 0.0:
+            yield from body.move_both([hold], speed=0.6)
+            raise SkillFailure(FailureCode.BODY_TOO_LOW, {"height_m": under_m + _EDGE_M})
+    yield from body.move_both([placement.above], speed=0.6)
+    outcome = luck(action)
+    if outcome != "success":
+        yield from body.move_both([*first, hold], speed=0.6)
+        raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
+    for _ in body.move_both([placement.at], speed=0.4):
+        yield
+        if body.rests(thing):
+            break
+    yield from wait(0.1)
+    for arm in Arm:
+        body.world.detach(arm.value)
+    wishes = {}
+    outward = body.turn_to_world(np.array([0.0, 1.0, 0.0]))
+    for arm, sign in ((Arm.LEFT, 1.0), (Arm.RIGHT, -1.0)):
+        position, hand = body.hand_pose(arm)
+        wishes[arm] = HandPose(position + sign * 0.09 * outward + 0.01 * _UP, hand[:, 0], hand[:, 1])
+    apart = body.solve_both(wishes, body.commanded_both())
+    yield from body.move_both([apart], speed=0.6)
+    yield from body.stow_both()
+    for _ in range(int(0.6 / CONTROL_DT_S)):
+        if body.world.speed_of(thing.object_id) < 0.02:
+            break
+        yield
+    if receptacle.object_id not in body.world.parents(thing.object_id):
+        gap = float(np.linalg.norm(body.world_position(thing.object_id) - body.world_position(receptacle.object_id)))
+        raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})
