@@ -115,9 +115,7 @@ class Expert:
 
     privileged: Final = True
 
-    def __init__(
-        self, session: Session, rehearsals: int | None = None, arms: Sequence[Arm] = (Arm.RIGHT, Arm.LEFT)
-    ) -> None:
+    def __init__(self, session: Session, rehearsals: int | None = None, arms: Sequence[Arm] = (Arm.RIGHT, Arm.LEFT)) -> None:
         """Attaches to a session.
 
         Args:

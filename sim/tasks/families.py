@@ -15,7 +15,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from sim.tasks.drafts import Builder, Draft, NoDraft, Scene
+from sim.tasks.drafts import Builder, Draft, Scene
 from sim.tasks.instructions import plural, preposition
 from sim.tasks.predicates import ANY, Predicate
 

@@ -32,7 +32,21 @@ _SPECIAL: Final[Mapping[str, str]] = {
 _ORDINALS: Final = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth")
 
 _ENCLOSING: Final = frozenset(
-    ("BathtubBasin", "Box", "Bowl", "Cabinet", "Cup", "Drawer", "Fridge", "GarbageCan", "LaundryHamper", "Microwave", "Mug", "Pot", "SinkBasin")
+    (
+        "BathtubBasin",
+        "Box",
+        "Bowl",
+        "Cabinet",
+        "Cup",
+        "Drawer",
+        "Fridge",
+        "GarbageCan",
+        "LaundryHamper",
+        "Microwave",
+        "Mug",
+        "Pot",
+        "SinkBasin",
+    )
 )
 
 #: Sentence templates by family. Slots: a, b objects; r, s receptacles; pr, ps their prepositions (`on` or `in`).

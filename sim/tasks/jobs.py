@@ -187,9 +187,7 @@ def _all_leaves(goals: Sequence[Predicate]) -> list[Predicate]:
     return [leaf for goal in goals for leaf in (_all_leaves(goal.of) if goal.of else [goal])]
 
 
-def _strays(
-    goals: Sequence[Predicate], leaves: Sequence[Predicate], light: Sequence[Predicate], facts: Facts
-) -> list[Job]:
+def _strays(goals: Sequence[Predicate], leaves: Sequence[Predicate], light: Sequence[Predicate], facts: Facts) -> list[Job]:
     """Putting away, or letting go of, what no goal wants in a hand."""
     kept = {goal.object_id for goal in _all_leaves(goals) if goal.kind == "held"} | {leaf.object_id for leaf in light}
     kept |= {leaf.object_id for leaf in leaves if leaf.kind == "filled"}

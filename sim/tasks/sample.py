@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, Literal
 
 import numpy as np
@@ -165,7 +165,9 @@ def sample_task(
     raise ValueError(f"no task of family {family!r} in room {room!r} from seed {seed} in {_ATTEMPTS} attempts")
 
 
-def settle(draft: Draft, task_id: str, seed: int, source: str, rng: np.random.Generator, robots: Sequence[str] = ROBOTS) -> Task:
+def settle(
+    draft: Draft, task_id: str, seed: int, source: str, rng: np.random.Generator, robots: Sequence[str] = ROBOTS
+) -> Task:
     """Gives a draft positions, a start, words and a budget.
 
     Raises:
