@@ -46,6 +46,8 @@ class Scene:
         lids: furniture with a lid.
         basins: basins with a tap, by the tap.
         heaters: furniture that heats what is on or in it, by its switch.
+        near: for switches and containers, the surfaces, switches and containers that the other hand may reach meanwhile.
+        roomy: targets with room for several things.
     """
 
     room: str
@@ -59,6 +61,8 @@ class Scene:
     lids: tuple[str, ...] = ()
     basins: Mapping[str, str] = field(default_factory=dict)
     heaters: Mapping[str, str] = field(default_factory=dict)
+    near: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    roomy: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
@@ -74,6 +78,7 @@ class Draft:
         goals: what must hold.
         focus: the ids that the instruction names, by slot (`a`, `b`, `c`, `r`, `s`).
         words: slots that are filled with words instead of an object.
+        beside: objects that stand close to something else, furniture or an earlier object.
     """
 
     family: str
@@ -84,6 +89,7 @@ class Draft:
     goals: list[Predicate] = field(default_factory=list)
     focus: dict[str, str] = field(default_factory=dict)
     words: dict[str, str] = field(default_factory=dict)
+    beside: dict[str, str] = field(default_factory=dict)
 
     def sentences(self, furniture: Sequence[str], rng: np.random.Generator, hidden: Sequence[str] = ()) -> tuple[str, ...]:
         """The family's wordings for this draft, in random order.
@@ -182,9 +188,16 @@ class Builder:
         options = sorted({place for fits in table.values() if len(fits) > 1 for place in fits})
         return self.choose(options, "furniture for a two-handed object")
 
-    def target(self, *others: str) -> str:
-        """Furniture to put things on, different from some."""
-        return self.choose([place for place in self.scene.targets if place not in others], "surface")
+    def target(self, *others: str, roomy: bool = False) -> str:
+        """Furniture to put things on, different from some, with room for several when asked."""
+        places = self.scene.roomy if roomy else self.scene.targets
+        return self.choose([place for place in places if place not in others], "surface")
+
+    def pair(self, first: Sequence[str], second: Sequence[str], what: str) -> tuple[str, str]:
+        """Furniture of two kinds that both hands may reach from one place."""
+        pairs = [f"{a} {c}" for a in first for c in self.scene.near.get(a, ()) if c in second]
+        a, c = self.choose(pairs, what).split()
+        return a, c
 
     def switch(self, on: bool, avoid: Sequence[str] = ()) -> str:
         """A switch of the room that is off, or `on`, at the start."""

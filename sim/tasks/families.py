@@ -196,7 +196,7 @@ def _use_up(b: Builder) -> None:
 
 
 def _transport_two(b: Builder) -> None:
-    r = b.target()
+    r = b.target(roomy=True)
     a = b.small(r, avoid=(r,))
     # Half of the time both stand together, so that both hands can reach at once.
     c = b.near(a, r) if b.rng.random() < 0.5 else b.small(r, avoid=(r,))
@@ -204,7 +204,7 @@ def _transport_two(b: Builder) -> None:
 
 
 def _transport_any_two(b: Builder) -> None:
-    r = b.target()
+    r = b.target(roomy=True)
     a = b.small(r, avoid=(r,))
     kind = a.rsplit("_", 1)[0]
     for _ in range(2):
@@ -223,28 +223,43 @@ def _transport_each(b: Builder) -> None:
 
 def _pick_and_toggle(on: bool) -> Callable[[Builder], None]:
     def build(b: Builder) -> None:
-        a = b.small()
-        switch = b.switch(on=not on)
+        lamps = b.unused(b.scene.small, among=("DeskLamp",))
+        if lamps and b.rng.random() < 0.5:
+            switch = b.small(among=lamps)
+            b.start(switch, isToggled=not on)
+            place = b.draft.objects[switch]
+        else:
+            switch, place = b.pair(b.scene.switches, b.scene.surfaces, "switch beside a surface")
+            b.draft.states.setdefault(switch, {})["isToggled"] = not on
+        a = b.small(at=place)
+        b.draft.beside[a] = switch
         b.ask(Predicate("held", a), Predicate("toggled_on" if on else "toggled_off", switch), a=a, b=switch)
 
     return build
 
 
 def _pick_and_open(b: Builder) -> None:
-    a = b.small()
-    c = b.container(is_open=False)
+    c, place = b.pair(b.scene.containers, b.scene.surfaces, "container beside a surface")
+    b.draft.states.setdefault(c, {})["isOpen"] = False
+    a = b.small(at=place)
+    b.draft.beside[a] = c
     b.ask(Predicate("held", a), Predicate("open", c), a=a, b=c)
 
 
 def _toggle_both(b: Builder) -> None:
-    a = _switchable(b, on=False)
-    c = b.switch(on=False, avoid=(a,))
-    b.ask(Predicate("toggled_on", a), Predicate("toggled_on", c), a=a, b=c)
+    a, c = b.pair(b.scene.switches, b.scene.switches, "pair of switches")
+    on = bool(b.rng.random() < 0.5)
+    for switch in (a, c):
+        b.draft.states.setdefault(switch, {})["isToggled"] = not on
+    b.small()
+    kind = "toggled_on" if on else "toggled_off"
+    b.draft.words["on"] = "on" if on else "off"
+    b.ask(Predicate(kind, a), Predicate(kind, c), a=a, b=c)
 
 
 def _fetch(b: Builder) -> None:
     s = b.container(is_open=False)
-    r = b.target()
+    r = b.target(roomy=True)
     a = b.small(r, at=s)
     b.ask(_located(a, r), a=a, r=r, s=s)
 
@@ -286,7 +301,7 @@ def _stow_two_close(b: Builder) -> None:
 
 
 def _set_three(b: Builder) -> None:
-    r = b.target()
+    r = b.target(roomy=True)
     a = b.small(r, avoid=(r,))
     c = b.near(a, r) if b.rng.random() < 0.5 else b.small(r, avoid=(r,))
     d = b.small(r, avoid=(r,))
@@ -294,7 +309,7 @@ def _set_three(b: Builder) -> None:
 
 
 def _tidy_three(b: Builder) -> None:
-    r = b.target()
+    r = b.target(roomy=True)
     s = b.target(r)
     a = b.small(r, avoid=(r, s))
     c = b.near(a, r) if b.rng.random() < 0.5 else b.small(r, avoid=(r, s))

@@ -238,10 +238,10 @@ TEMPLATES: Final[Mapping[str, tuple[str, ...]]] = {
         "Have {a}, filled from {b}, in one hand and {b} in the other.",
     ),
     "toggle_both": (
-        "Turn on {a} and {b}.",
-        "Switch on both {a} and {b}.",
-        "Make sure that {a} and {b} are running.",
-        "Please turn {a} on, and {b} too.",
+        "Turn {on} {a} and {b}.",
+        "Switch {on} both {a} and {b}.",
+        "Make sure that {a} and {b} are {on}.",
+        "Please turn {a} {on}, and {b} too.",
     ),
     "fetch": (
         "Take {a} out of {s} and put it {pr} {r}.",

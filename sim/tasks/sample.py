@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.catalogue import ObjectType, load_catalogue
-from sim.navigation import NavigationMap
+from sim.navigation import NavigationMap, Rectangle
 from sim.placement import OVERHANG_SHARE, fits_on
 from sim.robots.build_solver import robot_kit
 from sim.robots.spec import load_robot
-from sim.rooms import load_room, room_names
+from sim.rooms import Furniture, load_room, room_names
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach_map import reach_maps
 from sim.tasks.drafts import Draft, NoDraft, Scene
@@ -62,6 +62,10 @@ _SURFACE_TYPES: Final = (
 _PLACE_TYPES: Final = ("SinkBasin", "BathtubBasin", "GarbageCan", "StoveBurner", "Toilet")
 #: A television leaves no room for hands on its stand.
 _NO_TARGET_TYPES: Final = ("TVStand",)
+#: Targets with room for several things and hands.
+_ROOMY_TYPES: Final = (
+    "CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser", "Bed", "Sofa", "SinkBasin", "BathtubBasin",
+)  # fmt: skip
 _CONTAINER_TYPES: Final = ("Fridge", "Cabinet", "Drawer", "Microwave")
 _LID_TYPES: Final = ("Toilet",)
 _SWITCH_TYPES: Final = (
@@ -78,6 +82,13 @@ _EDGE_BAND_M: Final = 0.16
 #: Free distance between two objects of a task: a hand fits between.
 _HAND_GAP_M: Final = 0.09
 _REACH_MARGIN_M: Final = 0.02
+#: A surface so near to a switch or handle, and another switch so near, serve the other hand at the same time.
+_NEAR_M: Final = 0.45
+_PAIR_M: Final = 0.7
+#: Least distance between a switch or handle and an object beside it.
+_BESIDE_M: Final = 0.2
+_SPOTS: Final = 6
+_SMALL_RADIUS_M: Final = 0.06
 
 
 def rng_for(*key: object) -> np.random.Generator:
@@ -107,6 +118,12 @@ def scene_of(room: str) -> Scene:
                 rows[kind.name] = fits
         return rows
 
+    boxes = {item.id: _footprint(item, kinds[item.id]) for item in layout.furniture}
+    active, near = (*containers, *of(_SWITCH_TYPES)), {}
+    for name in active:
+        here = np.asarray(next(item.xy for item in layout.furniture if item.id == name))
+        gaps = {other: float(boxes[other].distance(here[None])[0]) for other in (*surfaces, *active) if other != name}
+        near[name] = tuple(other for other, gap in gaps.items() if gap <= (_NEAR_M if other in surfaces else _PAIR_M))
     heaters = {furniture: switch for switch, furniture in layout.links.items() if kinds[furniture].has("heat_source")}
     return Scene(
         room=room,
@@ -120,7 +137,14 @@ def scene_of(room: str) -> Scene:
         lids=of(_LID_TYPES),
         basins={tap: basin for tap, basin in layout.links.items() if kinds[tap].name == "Faucet"},
         heaters=heaters | {name: name for name in ids if kinds[name].name == "Microwave"},
+        near=near,
+        roomy=tuple(name for name in targets if kinds[name].name in _ROOMY_TYPES),
     )
+
+
+def _footprint(item: Furniture, kind: ObjectType) -> Rectangle:
+    """Rectangle on the floor below a piece of furniture."""
+    return Rectangle(item.xy, (kind.size[0] / 2.0, kind.size[1] / 2.0), float(np.deg2rad(item.yaw_deg)))
 
 
 def _takes_two_hands(kind: ObjectType) -> bool:
@@ -184,12 +208,13 @@ def settle(
         for name, carrier in draft.objects.items()
     )  # fmt: skip
     world = World(None, draft.room, placements, states=draft.states, seed=seed % 2**31, settle_s=0.05)
-    points = {name: _hand_point(world, name, draft) for name in draft.focus.values()}
+    points = {name: _hand_points(world, name, draft, rng) for name in draft.focus.values()}
     for name in robots:
         navigation = navigation_map(world, load_robot(name).footprint_radius_m)
-        for object_id, point in points.items():
-            if point is not None and not _in_reach(name, navigation, point):
-                raise WorldError(f"{name} does not reach {object_id} at {point.round(2)} in {draft.room}")
+        for object_id, choices in points.items():
+            if not any(_in_reach(name, navigation, point) for point in choices):
+                where = choices[0].round(2) if choices else "its spots, which are taken,"
+                raise WorldError(f"{name} does not reach {object_id} at {where} in {draft.room}")
     positions = {name: world.center(name)[:2] for name in world.objects}
     if source == "train":
         radius = max(load_robot(name).footprint_radius_m for name in robots)
@@ -246,6 +271,7 @@ def _spots(empty: World, draft: Draft, rng: np.random.Generator) -> dict[str, ND
     catalogue = load_catalogue()
     spots: dict[str, NDArray[np.float64]] = {}
     taken: list[tuple[NDArray[np.float64], float, str]] = []
+    spots_gap = 0.0
     for name, carrier in draft.objects.items():
         kind = catalogue.get(name.rsplit("_", 1)[0])
         radius, depth = float(np.hypot(kind.size[0], kind.size[1])) / 2.0, min(kind.size[0], kind.size[1])
@@ -255,30 +281,40 @@ def _spots(empty: World, draft: Draft, rng: np.random.Generator) -> dict[str, ND
         band = narrow + 0.06 if kind.name in _BIG_TYPES else max(_EDGE_BAND_M, narrow + 0.05)
         thing = empty.object(carrier)
         was_open, thing.openness = thing.openness, 1.0
+        other = draft.beside.get(name)
+        anchor = None if other is None else spots[other][:2] if other in spots else empty.pose(other)[:2, 3]
         for _ in range(12):
             spot = empty.free_spot(carrier, narrow, height_m=kind.size[2], rng=rng, band_m=band, gap_m=0.04)
-            if spot is not None and all(
-                other != carrier or float(np.linalg.norm(spot[:2] - place)) > radius + size + _HAND_GAP_M
-                for place, size, other in taken
+            if spot is None or any(
+                there == carrier and float(np.linalg.norm(spot[:2] - place)) <= radius + size + _HAND_GAP_M
+                for place, size, there in taken
             ):
-                spots[name] = spot
-                taken.append((spot[:2], radius, carrier))
+                continue
+            gap = 0.0 if anchor is None else float(np.linalg.norm(spot[:2] - anchor))
+            if name not in spots or (anchor is not None and _BESIDE_M + radius < gap < spots_gap):
+                spots[name], spots_gap = spot, gap
+            if anchor is None:
                 break
         thing.openness = was_open
+        if name in spots:
+            taken.append((spots[name][:2], radius, carrier))
         if name not in spots:
             raise WorldError(f"no room for {name} on {carrier} in {draft.room}")
     return spots
 
 
-def _hand_point(world: World, object_id: str, draft: Draft) -> NDArray[np.float64] | None:
-    """Where a hand has to get to for an object of the task, None for surfaces, which offer many points."""
+def _hand_points(world: World, object_id: str, draft: Draft, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+    """Where a hand has to get to for an object of the task: one of these points will do."""
     thing = world.object(object_id)
     goal = next((goal for goal in draft.goals if goal.object_id == object_id), None)
     if thing.movable and not (thing.moving and goal is not None and goal.kind in ("open", "closed")):
-        return world.center(object_id)
+        return [world.center(object_id)]
     if goal is not None and goal.kind.startswith("toggled"):
-        return world.toggle_point(object_id)
-    return world.handle(object_id) if thing.moving else None
+        return [world.toggle_point(object_id)]
+    if thing.moving:
+        return [world.handle(object_id)]
+    spots = [world.free_spot(object_id, _SMALL_RADIUS_M, rng=rng, band_m=_EDGE_BAND_M) for _ in range(_SPOTS)]
+    return [spot + (0.0, 0.0, 0.05) for spot in spots if spot is not None]
 
 
 @functools.cache
