@@ -38,7 +38,7 @@ from sim.contingency import load_contingency
 from sim.robots.spec import load_robot
 from sim.tasks.task import Task, load_benchmark, read_tasks
 
-__all__ = ["RUN_VERSION", "EvalRun", "evaluate", "plan_episodes", "run_folder", "select_tasks", "weights_digest"]
+__all__ = ["RUN_VERSION", "EvalRun", "evaluate", "plan_episodes", "run_folder", "select_tasks", "task_key", "weights_digest"]
 
 logger = logging.getLogger(__name__)
 
@@ -107,11 +107,15 @@ def config_hash(cfg: EvalConfig, digest: str) -> str:
     for name in ("label", "train", "weights", "source"):
         del planner[name]
     decides = {"planner": planner, "weights": digest, "robot": dataclasses.asdict(cfg.robot), "start": cfg.start}
-    decides["contingencies"] = hashlib.sha256(repr(load_contingency(cfg.contingencies)).encode()).hexdigest()
+    decides["contingencies"] = _contingencies_hash(cfg)
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def _task_key(task: Task) -> str:
+def _contingencies_hash(cfg: EvalConfig) -> str:
+    return hashlib.sha256(repr(load_contingency(cfg.contingencies)).encode()).hexdigest()
+
+
+def task_key(task: Task) -> str:
     """A task's id with a hash of its content, so that an edited task is another one."""
     return hashlib.sha256(json.dumps(task.to_json(), sort_keys=True).encode()).hexdigest()[:6]
 
@@ -130,7 +134,7 @@ def plan_episodes(cfg: EvalConfig, tasks: Sequence[Task], digest: str) -> list[E
                 difficulty=cfg.difficulty,
                 trial=trial,
                 seed=cfg.seed,
-                config_hash=f"{own}-{_task_key(task)}",
+                config_hash=f"{own}-{task_key(task)}",
             )
             jobs.append(EpisodeJob(fields, cfg.robot, task, episode_seed(cfg.seed, task.id, cfg.robot.name, trial)))
     return jobs
@@ -165,6 +169,7 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileg
         "robot": cfg.robot.name,
         "difficulty": cfg.difficulty,
         "contingencies": cfg.contingencies,
+        "contingencies_hash": _contingencies_hash(cfg),
         "category": cfg.category,
         "trials": cfg.trials,
         "limit": cfg.limit,
