@@ -7,11 +7,21 @@ from typing import Literal
 
 from configs.schema.robot import RobotConfig
 
-__all__ = ["CategoryName", "DifficultyName", "EvalConfig", "ExperimentConfig", "ExperimentName", "PlannerConfig", "StartName"]
+__all__ = [
+    "CategoryName",
+    "DifficultyName",
+    "EvalConfig",
+    "ExperimentConfig",
+    "ExperimentName",
+    "PlannerConfig",
+    "SplitName",
+    "StartName",
+]
 
 CategoryName = Literal["all", "single", "optional", "essential"]
 DifficultyName = Literal["easy", "medium", "hard", "natural"]
-StartName = Literal["fixed", "turned"]
+SplitName = Literal["all", "seen", "unseen"]
+StartName = Literal["fixed", "turned", "random"]
 ExperimentName = Literal["main_table", "ablation_table", "replanning_table", "failure_figure", "distribution_figures"]
 
 
@@ -85,7 +95,9 @@ class EvalConfig:
         contingencies: outcome distributions, a name of `configs/contingency` or of one's own assets.
         category: tasks of one category, or all.
         trials: episodes per task; the luck and the random streams differ between trials.
-        start: `fixed` starts where the task says, `turned` there with a heading drawn per trial.
+        start: `fixed` starts where the task says, `turned` there with a heading drawn per trial, `random` anywhere free in the
+            room with heading and pelvis height drawn per trial.
+        split: tasks whose `split` this is, or all.
         workers: processes; 0 runs in this one.
         seed: of the luck, hashed with task, robot and trial.
         tasks: `benchmark`, or the path of a JSON-lines file of tasks.
@@ -102,6 +114,7 @@ class EvalConfig:
     category: CategoryName = "all"
     trials: int = 1
     start: StartName = "fixed"
+    split: SplitName = "all"
     workers: int = 2
     seed: int = 0
     tasks: str = "benchmark"

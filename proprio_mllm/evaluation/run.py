@@ -79,7 +79,7 @@ def weights_digest(folder: Path) -> str:
 
 
 def select_tasks(cfg: EvalConfig) -> tuple[Task, ...]:
-    """The tasks of a run: the file's, of the wanted category, the first `limit` of each category.
+    """The tasks of a run: the file's, of the wanted split and category, the first `limit` of each category.
 
     Raises:
         ValueError: when the file is not there or no task is left.
@@ -92,12 +92,17 @@ def select_tasks(cfg: EvalConfig) -> tuple[Task, ...]:
         raise ValueError(f"tasks={cfg.tasks!r}: no such file; allowed: benchmark, or the path of a JSON-lines file")
     chosen: list[Task] = []
     count: dict[str, int] = {}
-    for task in tasks:
+    of_split = [task for task in tasks if cfg.split in ("all", task.split)]
+    if not of_split:
+        there = ", ".join(sorted({task.split for task in tasks}))
+        raise ValueError(f"tasks={cfg.tasks!r} has no task of split {cfg.split!r}; its tasks are of: {there or 'none'}")
+    for task in of_split:
         count[task.category] = count.get(task.category, 0) + 1
         if cfg.category in ("all", task.category) and (cfg.limit is None or count[task.category] <= cfg.limit):
             chosen.append(task)
     if not chosen:
-        raise ValueError(f"tasks={cfg.tasks!r} has no task of category {cfg.category!r}")
+        which = "" if cfg.split == "all" else f" and split {cfg.split!r}"
+        raise ValueError(f"tasks={cfg.tasks!r} has no task of category {cfg.category!r}{which}")
     return tuple(chosen)
 
 
@@ -153,6 +158,8 @@ def run_folder(cfg: EvalConfig, digest: str) -> Path:
         parts.append(cfg.contingencies)
     if cfg.start != "fixed":
         parts.append(cfg.start)
+    if cfg.split != "all":
+        parts.append(cfg.split)
     if cfg.seed != 0:
         parts.append(f"seed{cfg.seed}")
     if cfg.tasks != "benchmark":
@@ -174,6 +181,7 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileg
         "trials": cfg.trials,
         "limit": cfg.limit,
         "start": cfg.start,
+        "split": cfg.split,
         "seed": cfg.seed,
         "tasks": cfg.tasks,
         "weights": cfg.planner.weights,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
@@ -10,28 +9,14 @@ from configs.schema.eval import DifficultyName, StartName
 from configs.schema.robot import RobotConfig
 from data.records import Feedback, Observation, PlanStep
 from proprio_mllm.evaluation.episode import GoalReport, RunnableSession, Stats
-from proprio_mllm.evaluation.seeds import stream
+from proprio_mllm.evaluation.starts import started
 from proprio_mllm.planners.protocol import Planner
 from sim.session import Session
 from sim.tasks.task import Task
 
-__all__ = ["SimSession", "open_session", "started"]
+__all__ = ["SimSession", "open_session"]
 
 _sessions: dict[tuple[RobotConfig, str, int, str], Session] = {}
-
-
-def started(task: Task, start: StartName, luck: int) -> Task:
-    """The task with the start of an episode.
-
-    Args:
-        task: as the benchmark has it.
-        start: `fixed` leaves it; `turned` draws the heading, in steps of 5 degrees.
-        luck: the episode's seed.
-    """
-    if start == "fixed":
-        return task
-    yaw_deg = 5.0 * float(stream(luck, "start").integers(72))
-    return dataclasses.replace(task, start=dataclasses.replace(task.start, yaw_deg=yaw_deg))
 
 
 class SimSession:
@@ -99,7 +84,7 @@ def open_session(
     Args:
         robot: which robot acts.
         difficulty: success of low-level skills.
-        start: see `started`.
+        start: see `proprio_mllm.evaluation.starts`.
         task: the benchmark's task.
         luck: the episode's seed.
         planner: who plans.
@@ -114,7 +99,7 @@ def open_session(
 
         assert isinstance(planner, ExpertPlanner)
         planner.attach(session)
-    return SimSession(session, started(task, start, luck))
+    return SimSession(session, started(task, start, luck, _described(robot)))
 
 
 def _described(robot: RobotConfig) -> str:

@@ -69,7 +69,7 @@ def write_report(run: Run) -> Table:
 def newest(runs: Sequence[Run], planner: str, robot: str, difficulty: str, category: str = "all") -> Run | None:
     """The run to show in a cell: of these settings, the one with most episodes of the category, then the newest.
 
-    Runs over a part of the tasks (`limit`) or from other start poses are left out.
+    Runs over a part of the tasks (`limit`, `split`) or from other start poses are left out.
     """
     fitting = [
         run
@@ -77,6 +77,7 @@ def newest(runs: Sequence[Run], planner: str, robot: str, difficulty: str, categ
         if (run.metadata["planner"], run.metadata["robot"], run.metadata["difficulty"]) == (planner, robot, difficulty)
         and (run.metadata["tasks"], run.metadata["limit"], run.metadata["start"]) == ("benchmark", None, "fixed")
         and run.metadata["category"] in ("all", category)
+        and run.metadata.get("split", "all") == "all"
     ]
     rows = [(run, run.row(category)) for run in fitting]
     sized = [(run, row.episodes) for run, row in rows if row is not None]

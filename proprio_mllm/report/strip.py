@@ -23,7 +23,7 @@ from configs.validate import build
 from data.records import ActionError, EpisodeRecord, PlanStep
 from proprio_mllm.evaluation.run import select_tasks
 from proprio_mllm.evaluation.seeds import episode_seed
-from proprio_mllm.evaluation.sessions import started
+from proprio_mllm.evaluation.starts import started
 from proprio_mllm.report.runs import Run, load_run
 from sim.session import Session
 
@@ -70,8 +70,9 @@ def replay(run: Run, task: str, trial: int = 0, size: int = 320, camera: str = "
     cfg = build(EvalConfig, run.metadata["config"], "run.json config")
     found = next(one for one in select_tasks(cfg) if one.id == task)
     luck = episode_seed(record.seed, task, record.robot, trial)
-    session = Session(cfg.robot.spec or cfg.robot.name, cfg.difficulty, 0)
-    session.reset(started(found, cfg.start, luck), seed=luck)
+    robot = cfg.robot.spec or cfg.robot.name
+    session = Session(robot, cfg.difficulty, 0)
+    session.reset(started(found, cfg.start, luck, robot), seed=luck)
 
     def frame(text: str, failed: bool) -> Frame:
         world = session.world

@@ -100,6 +100,14 @@ def test_selection_refuses_what_is_not_there(cfg) -> None:
         select_tasks(only)
 
 
+def test_split_takes_the_tasks_of_a_split_and_names_those_there_are(cfg, task) -> None:
+    assert len(select_tasks(dataclasses.replace(cfg, split="all"))) == 4
+    for split in ("seen", "unseen"):
+        with pytest.raises(ValueError, match=f"no task of split '{split}'; its tasks are of: benchmark"):
+            select_tasks(dataclasses.replace(cfg, split=split))
+    assert "unseen" in run_folder(dataclasses.replace(cfg, split="unseen"), "").name
+
+
 def test_absent_weights_name_path_and_command(cfg, tmp_path) -> None:
     planner = PlannerConfig("proprio", "mllm", "P", str(tmp_path / "gone"), train="python train.py stage=all")
     with pytest.raises(WeightsError, match=r"gone.*python train\.py stage=all"):
