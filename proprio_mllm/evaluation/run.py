@@ -9,8 +9,8 @@ Paper: evaluation protocol (tasks, trials, temperature 0).
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import functools
 import hashlib
 import json
 import logging
@@ -26,11 +26,13 @@ import configs
 from configs.schema.eval import EvalConfig, PlannerConfig
 from data.files import file_hash, write_text
 from data.records import EpisodeRecord, Outcome
+from proprio_mllm.evaluation.batching import batch_planner
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
 from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledger, scored
-from proprio_mllm.evaluation.pool import run_jobs
+from proprio_mllm.evaluation.ray_pool import import_ray
+from proprio_mllm.evaluation.scheduling import scheduled
 from proprio_mllm.evaluation.seeds import episode_seed
-from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWorker, Opener, WorkerSetup, lost_episode
+from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, Opener, WorkerSetup
 from proprio_mllm.planners.file_planner import source_digest, split_source
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.planners.registry import make_planner
@@ -229,6 +231,10 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
         )
     load_robot(cfg.robot.spec or cfg.robot.name)  # a wrong description stops here, not in every episode
     planner, digest = _resolved(cfg.planner)
+    if cfg.scheduler == "ray":
+        import_ray(cfg.ray_address)  # a missing extra stops here, before anything is written
+    if cfg.batch > 1 and planner.kind == "file":
+        batch_planner(planner)
     jobs = plan_episodes(cfg, select_tasks(cfg), digest)
     folder = run_folder(cfg, digest)
     folder.mkdir(parents=True, exist_ok=True)
@@ -236,20 +242,25 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
     write_text(folder / "run.json", json.dumps(metadata, indent=1) + "\n")
     path = folder / "ledger.jsonl"
     with Ledger(path) as ledger:
-        done = set(scored(read_ledger(path)))
+        scores = scored(read_ledger(path))
         wanted = [_fields_key(job) for job in jobs]
-        missing = [job for job, key in zip(jobs, wanted, strict=True) if key not in done]
+        missing = [job for job, key in zip(jobs, wanted, strict=True) if key not in scores]
         if len(missing) < len(jobs):
             logger.info("%d of %d episodes are already in %s", len(jobs) - len(missing), len(jobs), path)
         setup = WorkerSetup(planner, cfg.difficulty, cfg.start, cfg.contingencies)
-        make = functools.partial(EpisodeWorker, setup) if opener is None else functools.partial(EpisodeWorker, setup, opener)
         # Long episodes first, so that the workers finish together.
         order = sorted(missing, key=lambda job: -job.task.step_budget)
+        solved = sum(scores[key].outcome is Outcome.SUCCESS for key in wanted if key in scores)
         title = f"{cfg.planner.name} {cfg.robot.name} {cfg.difficulty}"
-        with tqdm(total=len(jobs), initial=len(jobs) - len(missing), desc=title, unit="episode") as bar:
-            for result in run_jobs(make, order, cfg.workers, _broke, lost_episode, cfg.retries):
+        with (
+            tqdm(total=len(jobs), initial=len(jobs) - len(missing), desc=title, unit="episode") as bar,
+            contextlib.closing(scheduled(cfg, setup, order, _broke, opener)) as results,
+        ):
+            for result in results:
                 ledger.append(result.record)
                 if not _broke(result):
+                    solved += result.record.outcome is Outcome.SUCCESS
+                    bar.set_postfix_str(f"success {solved}/{bar.n + 1}", refresh=False)
                     bar.update(1)
     everything = read_ledger(path)
     scores = scored(everything)

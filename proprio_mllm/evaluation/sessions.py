@@ -1,4 +1,4 @@
-"""The simulator's session as the episode runner wants it; reused within a worker, by robot, difficulty and image size."""
+"""The simulator's session as the episode runner wants it; reused within a worker for the same settings and slot."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim.tasks.task import Task
 
 __all__ = ["SimSession", "open_session"]
 
-_sessions: dict[tuple[RobotConfig, str, int, str], Session] = {}
+_sessions: dict[tuple[RobotConfig, str, int, str, int], Session] = {}
 
 
 class SimSession:
@@ -78,6 +78,7 @@ def open_session(
     planner: Planner,
     *,
     contingency: str = "default",
+    slot: int = 0,
 ) -> RunnableSession:
     """A session for an episode; a privileged planner is attached to it.
 
@@ -89,8 +90,9 @@ def open_session(
         luck: the episode's seed.
         planner: who plans.
         contingency: outcome distributions.
+        slot: which of the episodes that go side by side in this process; each has a session of its own.
     """
-    key = (robot, difficulty, planner.image_size, contingency)
+    key = (robot, difficulty, planner.image_size, contingency, slot)
     if key not in _sessions:
         _sessions[key] = Session(_described(robot), difficulty, planner.image_size, contingency)
     session = _sessions[key]
