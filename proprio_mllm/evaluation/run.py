@@ -206,7 +206,7 @@ def _resolved(planner: PlannerConfig) -> tuple[PlannerConfig, str]:
     if planner.weights is None:
         return planner, ""
     folder = check_weights(found(planner.weights), planner.train)
-    return dataclasses.replace(planner, weights=str(folder)), weights_digest(folder)
+    return dataclasses.replace(planner, weights=str(folder.absolute())), weights_digest(folder)
 
 
 def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
