@@ -13,6 +13,8 @@ import contextlib
 import logging
 import os
 import shutil
+import signal
+import sys
 import tempfile
 import threading
 import time
@@ -37,6 +39,7 @@ logger = logging.getLogger(__name__)
 
 #: A model has to be read and its process started within this time.
 _STARTS_WITHIN_S: Final = 600.0
+_ENDS_WITHIN_S: Final = 10.0
 _POLL_S: Final = 0.05
 
 
@@ -99,6 +102,7 @@ def _connected(server: SocketServer) -> Connection[Any, Any]:
 
 def _serve(planner: PlannerConfig, batch: int, server: SocketServer) -> None:
     start_worker()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # ends tidily, so that nothing of it is left to clean up
     batcher = Batcher(batch_planner(planner), batch)
     with contextlib.suppress(FileNotFoundError):
         os.unlink(server.path)  # of a process that died
@@ -160,6 +164,8 @@ class ModelProcess:
     def stop(self) -> None:
         """Ends the process."""
         self.process.terminate()
+        self.process.join(_ENDS_WITHIN_S)
+        self.process.kill()
         self.process.join()
 
 
