@@ -7,11 +7,22 @@ from typing import Literal
 
 from configs.schema.robot import RobotConfig
 
-__all__ = ["CategoryName", "DifficultyName", "EvalConfig", "ExperimentConfig", "ExperimentName", "PlannerConfig", "StartName"]
+__all__ = [
+    "CategoryName",
+    "DifficultyName",
+    "EvalConfig",
+    "ExperimentConfig",
+    "ExperimentName",
+    "PlannerConfig",
+    "SplitName",
+    "StartName",
+]
 
 CategoryName = Literal["all", "single", "optional", "essential"]
 DifficultyName = Literal["easy", "medium", "hard", "natural"]
-StartName = Literal["fixed", "turned"]
+SplitName = Literal["all", "seen", "unseen"]
+SchedulerName = Literal["local", "ray"]
+StartName = Literal["fixed", "turned", "random"]
 ExperimentName = Literal["main_table", "ablation_table", "replanning_table", "failure_figure", "distribution_figures"]
 
 
@@ -85,8 +96,14 @@ class EvalConfig:
         contingencies: outcome distributions, a name of `configs/contingency` or of one's own assets.
         category: tasks of one category, or all.
         trials: episodes per task; the luck and the random streams differ between trials.
-        start: `fixed` starts where the task says, `turned` there with a heading drawn per trial.
+        start: `fixed` starts where the task says, `turned` there with a heading drawn per trial, `random` anywhere free in the
+            room with heading and pelvis height drawn per trial.
+        split: tasks whose `split` this is, or all.
         workers: processes; 0 runs in this one.
+        scheduler: who runs the workers: `local` this machine's process pool, `ray` a Ray instance or cluster.
+        ray_address: a running cluster's address; None starts Ray on this machine for the run.
+        batch: planner calls answered together, for models in this project's processes. Above 1, `workers=0` runs so many
+            episodes side by side, and otherwise one process holds the model and answers the workers.
         seed: of the luck, hashed with task, robot and trial.
         tasks: `benchmark`, or the path of a JSON-lines file of tasks.
         limit: only the first so many tasks of each category.
@@ -102,7 +119,11 @@ class EvalConfig:
     category: CategoryName = "all"
     trials: int = 1
     start: StartName = "fixed"
+    split: SplitName = "all"
     workers: int = 2
+    scheduler: SchedulerName = "local"
+    ray_address: str | None = None
+    batch: int = 1
     seed: int = 0
     tasks: str = "benchmark"
     limit: int | None = None
@@ -112,7 +133,17 @@ class EvalConfig:
 
     def __post_init__(self) -> None:
         _require(self.trials > 0, f"trials {self.trials} must be positive")
-        _require(0 <= self.workers <= 256, f"workers {self.workers} outside [0, 256]")
+        _require(0 <= self.workers <= 4096, f"workers {self.workers} outside [0, 4096]")
+        _require(1 <= self.batch <= 1024, f"batch {self.batch} outside [1, 1024]")
+        _require(self.scheduler == "local" or self.workers > 0, f"workers {self.workers} must be positive with scheduler=ray")
+        _require(
+            self.scheduler == "ray" or self.ray_address is None,
+            f"ray_address {self.ray_address!r} needs scheduler=ray, got {self.scheduler!r}",
+        )
+        _require(
+            self.batch == 1 or self.planner.kind in ("mllm", "file"),
+            f"batch {self.batch} with planner kind {self.planner.kind!r}; allowed: mllm, or file with begin and step_batch",
+        )
         _require(self.limit is None or self.limit > 0, f"limit {self.limit} must be positive or null")
         _require(self.retries >= 0, f"retries {self.retries} must not be negative")
         _require(self.seed >= 0, f"seed {self.seed} must not be negative")

@@ -15,16 +15,29 @@ import logging
 import math
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
+
+import numpy as np
 
 from data.records import EpisodeRecord, Feedback, HistoryItem, Observation, Outcome, PlanStep
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, attribute
 from proprio_mllm.evaluation.seeds import stream
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
 
-__all__ = ["EpisodeKeyFields", "GoalReport", "RunnableSession", "Stats", "Watcher", "run_episode"]
+__all__ = [
+    "Ask",
+    "Begin",
+    "Episode",
+    "EpisodeKeyFields",
+    "GoalReport",
+    "RunnableSession",
+    "Stats",
+    "Watcher",
+    "episode_steps",
+    "run_episode",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -93,6 +106,26 @@ class EpisodeKeyFields:
     config_hash: str
 
 
+@dataclass(frozen=True, slots=True)
+class Begin:
+    """An episode asks its planner to start: answered by nothing."""
+
+    task: TaskInfo
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """An episode asks its planner for the next step: answered by a `PlannerReply`."""
+
+    observation: Observation
+    feedback: Feedback | None
+
+
+#: An episode that pauses wherever it needs its planner; first one `Begin`, then `Ask`s, at its end the record.
+Episode = Generator[Begin | Ask, PlannerReply | None, EpisodeRecord]
+
+
 def run_episode(
     open_session: Callable[[], RunnableSession],
     planner: Planner,
@@ -102,16 +135,49 @@ def run_episode(
     luck: int,
     watch: Watcher | None = None,
 ) -> EpisodeRecord:
-    """Runs an episode to its end.
+    """Runs an episode to its end with a planner of its own; see `episode_steps` for the arguments.
+
+    Returns:
+        The record; on any exception one with the outcome `INFRASTRUCTURE_ERROR` and the error's text.
+    """
+    episode = episode_steps(open_session, fields, instruction, step_budget, luck, watch)
+    try:
+        request = next(episode)
+        while True:
+            try:
+                answer = None
+                if isinstance(request, Begin):
+                    planner.reset(request.task, request.rng)
+                else:
+                    answer = planner.step(request.observation, request.feedback)
+            except Exception as error:  # noqa: BLE001  # what breaks in the planner is recorded by the episode
+                request = episode.throw(error)
+            else:
+                request = episode.send(answer)
+    except StopIteration as end:
+        return end.value
+
+
+def episode_steps(
+    open_session: Callable[[], RunnableSession],
+    fields: EpisodeKeyFields,
+    instruction: str,
+    step_budget: int,
+    luck: int,
+    watch: Watcher | None = None,
+) -> Episode:
+    """An episode that pauses wherever it needs its planner, so that several can go side by side in one thread.
 
     Args:
         open_session: makes the session; called inside the guarded part.
-        planner: who plans.
         fields: the episode's key.
         instruction: the task's instruction.
         step_budget: steps allowed.
         luck: the episode's seed (`seeds.episode_seed`), for the session and the planner's random stream.
         watch: sees every observation.
+
+    Yields:
+        What the planner is asked. An exception thrown in becomes part of the record.
 
     Returns:
         The record; on any exception one with the outcome `INFRASTRUCTURE_ERROR` and the error's text.
@@ -121,8 +187,8 @@ def run_episode(
     try:
         session = open_session()
         observation = session.reset(luck)
-        planner.reset(TaskInfo(instruction, fields.robot, step_budget), stream(luck, "planner"))
-        done = _loop(session, planner, observation, step_budget, tally, watch)
+        yield Begin(TaskInfo(instruction, fields.robot, step_budget), stream(luck, "planner"))
+        done = yield from _loop(session, observation, step_budget, tally, watch)
         goals, stats = session.goals(), session.stats()
     except Exception as error:  # noqa: BLE001  # an episode must never end the run; the record tells what happened
         logger.warning("%s on %s, trial %d: %s", fields.planner, fields.task, fields.trial, error)
@@ -154,12 +220,11 @@ class _Tally:
 
 def _loop(
     session: RunnableSession,
-    planner: Planner,
     observation: Observation,
     step_budget: int,
     tally: _Tally,
     watch: Watcher | None,
-) -> bool:
+) -> Generator[Ask, PlannerReply | None, bool]:
     """Steps until the end; returns whether the planner ended the episode itself."""
     history: list[HistoryItem] = []
     reply: PlannerReply | None = None
@@ -169,7 +234,8 @@ def _loop(
         shown = _shown(observation, history, number, step_budget)
         if watch is not None:
             watch(shown, reply, feedback)
-        reply = planner.step(shown, None if feedback is None else feedback.public())
+        reply = yield Ask(shown, None if feedback is None else feedback.public())
+        assert reply is not None
         tally.calls += 1
         if not math.isfinite(reply.latency_s):
             raise ValueError(f"the reply's latency_s is {reply.latency_s}; allowed: seconds")

@@ -1,9 +1,9 @@
 """Episodes on several processes: each worker has its own simulator, planner and one thread.
 
 Physics and rendering take about as long as the small model (measured: about 0.3 s of one core per step each), so one model per
-worker keeps every core busy without batching. Batching all workers' questions in one process was not measured. Workers are
-spawned, never forked, because torch and GL are loaded. Rows of a batch of one do not depend on what else runs, so results do
-not depend on the number of workers.
+worker keeps every core busy. A large model is better asked for many episodes at once: `run_side_by_side` in one process,
+`serving` for many. Workers are spawned, never forked, because torch and GL are loaded. Rows of a batch of one do not depend on
+what else runs, so results do not depend on the number of workers.
 
 A worker that dies takes its pool with it; the pool is made anew, and an episode that was under way when that happened more than
 `retries` times becomes an infrastructure error.
@@ -12,7 +12,8 @@ A worker that dies takes its pool with it; the pool is made anew, and an episode
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from data.workers import start_worker
 
-__all__ = ["Worker", "run_jobs"]
+__all__ = ["SideBySide", "Worker", "run_jobs", "run_side_by_side"]
 
 logger = logging.getLogger(__name__)
 
@@ -88,6 +89,40 @@ def run_jobs(
         return
     while queue:
         yield from _run_pool(make, queue, min(workers, len(queue)), failed, lost, retries)
+
+
+class SideBySide(Protocol[J, R_co]):
+    """Does several jobs at a time in one thread."""
+
+    def side_by_side(self, queue: deque[J], count: int) -> Iterator[tuple[J, R_co]]:
+        """Jobs with their results; the queue is emptied, and what is appended meanwhile is done too."""
+        ...
+
+
+def run_side_by_side(
+    make: Callable[[], SideBySide[J, R]],
+    jobs: Sequence[J],
+    count: int,
+    failed: Callable[[R], bool],
+    name: Callable[[J], Hashable],
+    retries: int = 1,
+) -> Iterator[R]:
+    """As `run_jobs` with no worker process, with up to `count` jobs at a time.
+
+    Args:
+        make: makes the worker.
+        jobs: what is to be done, in the order it is started.
+        count: jobs at a time.
+        failed: whether a result is worth another attempt. Every attempt's result is given out.
+        name: what tells jobs apart.
+        retries: further attempts per job.
+    """
+    queue, attempts = deque(jobs), Counter[Hashable]()
+    for job, result in make().side_by_side(queue, count):
+        yield result
+        attempts[name(job)] += 1
+        if failed(result) and attempts[name(job)] <= retries:
+            queue.append(job)
 
 
 def _run_pool(

@@ -9,8 +9,8 @@ Paper: evaluation protocol (tasks, trials, temperature 0).
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import functools
 import hashlib
 import json
 import logging
@@ -26,11 +26,13 @@ import configs
 from configs.schema.eval import EvalConfig, PlannerConfig
 from data.files import file_hash, write_text
 from data.records import EpisodeRecord, Outcome
+from proprio_mllm.evaluation.batching import batch_planner
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
 from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledger, scored
-from proprio_mllm.evaluation.pool import run_jobs
+from proprio_mllm.evaluation.ray_pool import import_ray
+from proprio_mllm.evaluation.scheduling import scheduled
 from proprio_mllm.evaluation.seeds import episode_seed
-from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWorker, Opener, WorkerSetup, lost_episode
+from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, Opener, WorkerSetup
 from proprio_mllm.planners.file_planner import source_digest, split_source
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.planners.registry import make_planner
@@ -38,7 +40,7 @@ from sim.contingency import load_contingency
 from sim.robots.spec import load_robot
 from sim.tasks.task import Task, load_benchmark, read_tasks
 
-__all__ = ["RUN_VERSION", "EvalRun", "evaluate", "plan_episodes", "run_folder", "select_tasks", "weights_digest"]
+__all__ = ["RUN_VERSION", "EvalRun", "evaluate", "plan_episodes", "run_folder", "select_tasks", "task_key", "weights_digest"]
 
 logger = logging.getLogger(__name__)
 
@@ -79,7 +81,7 @@ def weights_digest(folder: Path) -> str:
 
 
 def select_tasks(cfg: EvalConfig) -> tuple[Task, ...]:
-    """The tasks of a run: the file's, of the wanted category, the first `limit` of each category.
+    """The tasks of a run: the file's, of the wanted split and category, the first `limit` of each category.
 
     Raises:
         ValueError: when the file is not there or no task is left.
@@ -92,12 +94,17 @@ def select_tasks(cfg: EvalConfig) -> tuple[Task, ...]:
         raise ValueError(f"tasks={cfg.tasks!r}: no such file; allowed: benchmark, or the path of a JSON-lines file")
     chosen: list[Task] = []
     count: dict[str, int] = {}
-    for task in tasks:
+    of_split = [task for task in tasks if cfg.split in ("all", task.split)]
+    if not of_split:
+        there = ", ".join(sorted({task.split for task in tasks}))
+        raise ValueError(f"tasks={cfg.tasks!r} has no task of split {cfg.split!r}; its tasks are of: {there or 'none'}")
+    for task in of_split:
         count[task.category] = count.get(task.category, 0) + 1
         if cfg.category in ("all", task.category) and (cfg.limit is None or count[task.category] <= cfg.limit):
             chosen.append(task)
     if not chosen:
-        raise ValueError(f"tasks={cfg.tasks!r} has no task of category {cfg.category!r}")
+        which = "" if cfg.split == "all" else f" and split {cfg.split!r}"
+        raise ValueError(f"tasks={cfg.tasks!r} has no task of category {cfg.category!r}{which}")
     return tuple(chosen)
 
 
@@ -107,11 +114,15 @@ def config_hash(cfg: EvalConfig, digest: str) -> str:
     for name in ("label", "train", "weights", "source"):
         del planner[name]
     decides = {"planner": planner, "weights": digest, "robot": dataclasses.asdict(cfg.robot), "start": cfg.start}
-    decides["contingencies"] = hashlib.sha256(repr(load_contingency(cfg.contingencies)).encode()).hexdigest()
+    decides["contingencies"] = _contingencies_hash(cfg)
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def _task_key(task: Task) -> str:
+def _contingencies_hash(cfg: EvalConfig) -> str:
+    return hashlib.sha256(repr(load_contingency(cfg.contingencies)).encode()).hexdigest()
+
+
+def task_key(task: Task) -> str:
     """A task's id with a hash of its content, so that an edited task is another one."""
     return hashlib.sha256(json.dumps(task.to_json(), sort_keys=True).encode()).hexdigest()[:6]
 
@@ -130,7 +141,7 @@ def plan_episodes(cfg: EvalConfig, tasks: Sequence[Task], digest: str) -> list[E
                 difficulty=cfg.difficulty,
                 trial=trial,
                 seed=cfg.seed,
-                config_hash=f"{own}-{_task_key(task)}",
+                config_hash=f"{own}-{task_key(task)}",
             )
             jobs.append(EpisodeJob(fields, cfg.robot, task, episode_seed(cfg.seed, task.id, cfg.robot.name, trial)))
     return jobs
@@ -149,6 +160,8 @@ def run_folder(cfg: EvalConfig, digest: str) -> Path:
         parts.append(cfg.contingencies)
     if cfg.start != "fixed":
         parts.append(cfg.start)
+    if cfg.split != "all":
+        parts.append(cfg.split)
     if cfg.seed != 0:
         parts.append(f"seed{cfg.seed}")
     if cfg.tasks != "benchmark":
@@ -165,10 +178,12 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileg
         "robot": cfg.robot.name,
         "difficulty": cfg.difficulty,
         "contingencies": cfg.contingencies,
+        "contingencies_hash": _contingencies_hash(cfg),
         "category": cfg.category,
         "trials": cfg.trials,
         "limit": cfg.limit,
         "start": cfg.start,
+        "split": cfg.split,
         "seed": cfg.seed,
         "tasks": cfg.tasks,
         "weights": cfg.planner.weights,
@@ -191,7 +206,7 @@ def _resolved(planner: PlannerConfig) -> tuple[PlannerConfig, str]:
     if planner.weights is None:
         return planner, ""
     folder = check_weights(found(planner.weights), planner.train)
-    return dataclasses.replace(planner, weights=str(folder)), weights_digest(folder)
+    return dataclasses.replace(planner, weights=str(folder.absolute())), weights_digest(folder)
 
 
 def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
@@ -216,6 +231,10 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
         )
     load_robot(cfg.robot.spec or cfg.robot.name)  # a wrong description stops here, not in every episode
     planner, digest = _resolved(cfg.planner)
+    if cfg.scheduler == "ray":
+        import_ray(cfg.ray_address)  # a missing extra stops here, before anything is written
+    if cfg.batch > 1 and planner.kind == "file":
+        batch_planner(planner)
     jobs = plan_episodes(cfg, select_tasks(cfg), digest)
     folder = run_folder(cfg, digest)
     folder.mkdir(parents=True, exist_ok=True)
@@ -223,20 +242,25 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
     write_text(folder / "run.json", json.dumps(metadata, indent=1) + "\n")
     path = folder / "ledger.jsonl"
     with Ledger(path) as ledger:
-        done = set(scored(read_ledger(path)))
+        scores = scored(read_ledger(path))
         wanted = [_fields_key(job) for job in jobs]
-        missing = [job for job, key in zip(jobs, wanted, strict=True) if key not in done]
+        missing = [job for job, key in zip(jobs, wanted, strict=True) if key not in scores]
         if len(missing) < len(jobs):
             logger.info("%d of %d episodes are already in %s", len(jobs) - len(missing), len(jobs), path)
         setup = WorkerSetup(planner, cfg.difficulty, cfg.start, cfg.contingencies)
-        make = functools.partial(EpisodeWorker, setup) if opener is None else functools.partial(EpisodeWorker, setup, opener)
         # Long episodes first, so that the workers finish together.
         order = sorted(missing, key=lambda job: -job.task.step_budget)
+        solved = sum(scores[key].outcome is Outcome.SUCCESS for key in wanted if key in scores)
         title = f"{cfg.planner.name} {cfg.robot.name} {cfg.difficulty}"
-        with tqdm(total=len(jobs), initial=len(jobs) - len(missing), desc=title, unit="episode") as bar:
-            for result in run_jobs(make, order, cfg.workers, _broke, lost_episode, cfg.retries):
+        with (
+            tqdm(total=len(jobs), initial=len(jobs) - len(missing), desc=title, unit="episode") as bar,
+            contextlib.closing(scheduled(cfg, setup, order, _broke, opener)) as results,
+        ):
+            for result in results:
                 ledger.append(result.record)
                 if not _broke(result):
+                    solved += result.record.outcome is Outcome.SUCCESS
+                    bar.set_postfix_str(f"success {solved}/{bar.n + 1}", refresh=False)
                     bar.update(1)
     everything = read_ledger(path)
     scores = scored(everything)

@@ -1,8 +1,7 @@
-"""The simulator's session as the episode runner wants it; reused within a worker, by robot, difficulty and image size."""
+"""The simulator's session as the episode runner wants it; reused within a worker for the same settings and slot."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
@@ -10,28 +9,14 @@ from configs.schema.eval import DifficultyName, StartName
 from configs.schema.robot import RobotConfig
 from data.records import Feedback, Observation, PlanStep
 from proprio_mllm.evaluation.episode import GoalReport, RunnableSession, Stats
-from proprio_mllm.evaluation.seeds import stream
+from proprio_mllm.evaluation.starts import started
 from proprio_mllm.planners.protocol import Planner
 from sim.session import Session
 from sim.tasks.task import Task
 
-__all__ = ["SimSession", "open_session", "started"]
+__all__ = ["SimSession", "open_session"]
 
-_sessions: dict[tuple[RobotConfig, str, int, str], Session] = {}
-
-
-def started(task: Task, start: StartName, luck: int) -> Task:
-    """The task with the start of an episode.
-
-    Args:
-        task: as the benchmark has it.
-        start: `fixed` leaves it; `turned` draws the heading, in steps of 5 degrees.
-        luck: the episode's seed.
-    """
-    if start == "fixed":
-        return task
-    yaw_deg = 5.0 * float(stream(luck, "start").integers(72))
-    return dataclasses.replace(task, start=dataclasses.replace(task.start, yaw_deg=yaw_deg))
+_sessions: dict[tuple[RobotConfig, str, int, str, int], Session] = {}
 
 
 class SimSession:
@@ -94,19 +79,21 @@ def open_session(
     planner: Planner,
     *,
     contingency: str = "default",
+    slot: int = 0,
 ) -> RunnableSession:
     """A session for an episode; a privileged planner is attached to it.
 
     Args:
         robot: which robot acts.
         difficulty: success of low-level skills.
-        start: see `started`.
+        start: see `proprio_mllm.evaluation.starts`.
         task: the benchmark's task.
         luck: the episode's seed.
         planner: who plans.
         contingency: outcome distributions.
+        slot: which of the episodes that go side by side in this process; each has a session of its own.
     """
-    key = (robot, difficulty, planner.image_size, contingency)
+    key = (robot, difficulty, planner.image_size, contingency, slot)
     if key not in _sessions:
         _sessions[key] = Session(_described(robot), difficulty, planner.image_size, contingency)
     session = _sessions[key]
@@ -115,7 +102,7 @@ def open_session(
 
         assert isinstance(planner, ExpertPlanner)
         planner.attach(session)
-    return SimSession(session, started(task, start, luck))
+    return SimSession(session, started(task, start, luck, _described(robot)))
 
 
 def _described(robot: RobotConfig) -> str:

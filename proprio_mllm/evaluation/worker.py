@@ -7,22 +7,32 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from configs.schema.eval import DifficultyName, PlannerConfig, StartName
 from configs.schema.robot import RobotConfig
 from data.records import EpisodeRecord, Outcome
-from proprio_mllm.evaluation.episode import EpisodeKeyFields, RunnableSession, run_episode
-from proprio_mllm.planners.protocol import Planner
+from proprio_mllm.evaluation.batching import answer_all
+from proprio_mllm.evaluation.episode import (
+    Ask,
+    Begin,
+    Episode,
+    EpisodeKeyFields,
+    RunnableSession,
+    episode_steps,
+    run_episode,
+)
+from proprio_mllm.planners.protocol import BatchPlanner, Planner, PlannerReply
 from proprio_mllm.planners.registry import make_planner
 from sim.tasks.task import Task
 
 if TYPE_CHECKING:
     from proprio_mllm.evaluation.recording import RolloutRecorder
 
-__all__ = ["EpisodeJob", "EpisodeResult", "EpisodeWorker", "Opener", "WorkerSetup", "lost_episode"]
+__all__ = ["EpisodeJob", "EpisodeResult", "EpisodeWorker", "Opener", "PlannerServer", "WorkerSetup", "lost_episode"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +44,22 @@ class WorkerSetup:
         difficulty: success of low-level skills.
         start: see `EvalConfig.start`.
         contingency: see `EvalConfig.contingencies`.
+        server: gives a planner that asks a model in another process; None makes the planner here.
     """
 
     planner: PlannerConfig
     difficulty: DifficultyName
     start: StartName
     contingency: str = "default"
+    server: PlannerServer | None = None
+
+
+class PlannerServer(Protocol):
+    """Where a model runs that many workers ask; `proprio_mllm.evaluation.serving` and `ray_pool` have one each."""
+
+    def connect(self) -> Planner:
+        """A planner that asks it."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +72,7 @@ class EpisodeJob:
         task: its task.
         luck: its seed.
         record: whether observations are kept for training.
+        slot: which of the episodes that go side by side in its process.
     """
 
     fields: EpisodeKeyFields
@@ -59,6 +80,7 @@ class EpisodeJob:
     task: Task
     luck: int
     record: bool = False
+    slot: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +98,9 @@ Opener = Callable[[WorkerSetup, EpisodeJob, Planner], RunnableSession]
 def _open(setup: WorkerSetup, job: EpisodeJob, planner: Planner) -> RunnableSession:
     from proprio_mllm.evaluation.sessions import open_session  # physics and rendering load only where they run
 
-    return open_session(job.robot, setup.difficulty, setup.start, job.task, job.luck, planner, contingency=setup.contingency)
+    return open_session(
+        job.robot, setup.difficulty, setup.start, job.task, job.luck, planner, contingency=setup.contingency, slot=job.slot
+    )
 
 
 class EpisodeWorker:
@@ -91,38 +115,120 @@ class EpisodeWorker:
         logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
         self.setup = setup
         self._opener = opener
-        if setup.planner.kind == "expert":
-            from proprio_mllm.evaluation.privileged import ExpertPlanner
-
-            self.planner: Planner = ExpertPlanner(setup.planner.image_size)
-        else:
-            if setup.planner.kind == "mllm":
-                import torch
-
-                torch.set_num_threads(1)
-            self.planner = make_planner(setup.planner)
+        self.planner = _planner(setup)
 
     def __call__(self, job: EpisodeJob) -> EpisodeResult:
         """Runs one episode."""
-        recorder = _recorder() if job.record else None
-        opened: list[RunnableSession] = []
+        recorder, opened = _recorder() if job.record else None, list[RunnableSession]()
+        task, watch = job.task, None if recorder is None else recorder.watch
+        opening = self._opening(job, opened)
+        record = run_episode(opening, self.planner, job.fields, task.instruction, task.step_budget, job.luck, watch)
+        return _result(job, record, recorder, opened)
 
+    def side_by_side(self, queue: deque[EpisodeJob], count: int) -> Iterator[tuple[EpisodeJob, EpisodeResult]]:
+        """Runs the episodes of a queue in this thread, up to `count` at a time, and asks the planner for all of them at once.
+
+        The simulator's part of the episodes takes turns; the order of everything is fixed by the queue.
+
+        Args:
+            queue: is emptied; what is appended meanwhile is run too.
+            count: episodes at a time.
+
+        Yields:
+            Each job with its result, in the order they end.
+
+        Raises:
+            ValueError: when the planner answers one episode at a time only.
+        """
+        planner = self.planner
+        if not isinstance(planner, BatchPlanner):
+            raise ValueError(
+                f"planner {self.setup.planner.name!r} answers one episode at a time: it has no begin and step_batch"
+            )
+        running: dict[int, _Running] = {}
+        while queue or running:
+            for slot in range(count):
+                if queue and slot not in running:
+                    running[slot] = self._started(dataclasses.replace(queue.popleft(), slot=slot))
+            for one in running.values():
+                if isinstance(one.request, Begin):
+                    one.begin(planner)
+            asked = [one for one in running.values() if isinstance(one.request, Ask)]
+            seen = [one.request.observation for one in asked if isinstance(one.request, Ask)]
+            answers = answer_all(planner, seen, [one.state for one in asked])
+            for one, answer in zip(asked, answers, strict=True):
+                one.go_on(answer)
+            for slot in [slot for slot, one in running.items() if one.record is not None]:
+                one = running.pop(slot)
+                assert one.record is not None
+                yield one.job, _result(one.job, one.record, one.recorder, one.opened)
+
+    def _opening(self, job: EpisodeJob, opened: list[RunnableSession]) -> Callable[[], RunnableSession]:
         def open_session() -> RunnableSession:
             opened.append(self._opener(self.setup, job, self.planner))
             return opened[-1]
 
-        record = run_episode(
-            open_session,
-            self.planner,
-            job.fields,
-            job.task.instruction,
-            job.task.step_budget,
-            job.luck,
-            None if recorder is None else recorder.watch,
-        )
-        if recorder is None or record.outcome is Outcome.INFRASTRUCTURE_ERROR:
-            return EpisodeResult(record)
-        return EpisodeResult(record, recorder.row(job.task, record, opened[-1].relations()))
+        return open_session
+
+    def _started(self, job: EpisodeJob) -> _Running:
+        recorder, opened = _recorder() if job.record else None, list[RunnableSession]()
+        task, watch = job.task, None if recorder is None else recorder.watch
+        episode = episode_steps(self._opening(job, opened), job.fields, task.instruction, task.step_budget, job.luck, watch)
+        one = _Running(job, episode, recorder, opened)
+        one.go_on(None)
+        return one
+
+
+@dataclass(slots=True)
+class _Running:
+    """One of the episodes that go side by side: what it asks now, or its record."""
+
+    job: EpisodeJob
+    episode: Episode
+    recorder: RolloutRecorder | None
+    opened: list[RunnableSession]
+    request: Begin | Ask | None = None
+    state: Any = None
+    record: EpisodeRecord | None = None
+
+    def go_on(self, answer: PlannerReply | Exception | None) -> None:
+        """Hands over an answer, or the error there was instead, and runs to the next question or the end."""
+        try:
+            self.request = self.episode.throw(answer) if isinstance(answer, Exception) else self.episode.send(answer)
+        except StopIteration as end:
+            self.request, self.record = None, end.value
+
+    def begin(self, planner: BatchPlanner) -> None:
+        """Starts the planner's side of the episode."""
+        assert isinstance(self.request, Begin)
+        try:
+            self.state = planner.begin(self.request.task, self.request.rng)
+        except Exception as error:  # noqa: BLE001  # what breaks in the planner is recorded by the episode
+            self.go_on(error)
+        else:
+            self.go_on(None)
+
+
+def _planner(setup: WorkerSetup) -> Planner:
+    if setup.server is not None:
+        return setup.server.connect()
+    if setup.planner.kind == "expert":
+        from proprio_mllm.evaluation.privileged import ExpertPlanner
+
+        return ExpertPlanner(setup.planner.image_size)
+    if setup.planner.kind == "mllm":
+        import torch
+
+        torch.set_num_threads(1)
+    return make_planner(setup.planner)
+
+
+def _result(
+    job: EpisodeJob, record: EpisodeRecord, recorder: RolloutRecorder | None, opened: Sequence[RunnableSession]
+) -> EpisodeResult:
+    if recorder is None or record.outcome is Outcome.INFRASTRUCTURE_ERROR:
+        return EpisodeResult(record)
+    return EpisodeResult(record, recorder.row(job.task, record, opened[-1].relations()))
 
 
 def _recorder() -> RolloutRecorder:

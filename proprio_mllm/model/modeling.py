@@ -183,7 +183,7 @@ class ProprioMLLM(nn.Module):
         batch: Batch,
         max_new_tokens: int = 48,
         temperature: float = 0.0,
-        generator: torch.Generator | None = None,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ) -> list[list[int]]:
         """Continues each row of a left-padded batch.
 
@@ -191,14 +191,16 @@ class ProprioMLLM(nn.Module):
             batch: from the collator with `generation=True`.
             max_new_tokens: longest reply.
             temperature: 0 takes the most likely token, otherwise tokens are drawn.
-            generator: draws the tokens; on the CPU.
+            generator: draws the tokens, on the CPU; one per row keeps a row's draws apart from the other rows'.
 
         Returns:
             The new token ids of each row, without the closing token.
 
         Raises:
-            ValueError: on right padding or a negative temperature.
+            ValueError: on right padding, a negative temperature, or another number of generators than rows.
         """
+        if isinstance(generator, Sequence) and len(generator) != len(batch.input_ids):
+            raise ValueError(f"{len(generator)} generators for {len(batch.input_ids)} rows; allowed: one, or one per row")
         if temperature < 0:
             raise ValueError(f"temperature {temperature} must not be negative")
         if int(batch.attention_mask[:, -1].min()) == 0:
@@ -230,10 +232,13 @@ class ProprioMLLM(nn.Module):
         return replies
 
     @staticmethod
-    def _choose(logits: Tensor, temperature: float, generator: torch.Generator | None) -> Tensor:
+    def _choose(logits: Tensor, temperature: float, generator: torch.Generator | Sequence[torch.Generator] | None) -> Tensor:
         if temperature == 0:
             return logits.argmax(-1)
         shares = (logits / temperature).softmax(-1).cpu()
+        if isinstance(generator, Sequence):
+            rows = [torch.multinomial(row, 1, generator=own) for row, own in zip(shares, generator, strict=True)]
+            return torch.cat(rows).to(logits.device)
         return torch.multinomial(shares, 1, generator=generator)[:, 0].to(logits.device)
 
     def reply(self, batch: Batch, max_new_tokens: int = 48, temperature: float = 0.0) -> list[str]:

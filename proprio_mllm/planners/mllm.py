@@ -77,20 +77,26 @@ class MllmPlanner:
             model = model.to("cuda")
         return MllmPlanner(model, load_motion(path), temperature, max_new_tokens)
 
+    def begin(self, task: TaskInfo, rng: np.random.Generator) -> torch.Generator:
+        """The generator that draws the tokens of a new episode."""
+        return torch.Generator().manual_seed(int(rng.integers(2**31)))
+
     def reset(self, task: TaskInfo, rng: np.random.Generator) -> None:
         """Seeds the token draws of the new episode."""
-        self._generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+        self._generator = self.begin(task, rng)
 
     def step(self, observation: Observation, feedback: Feedback | None) -> PlannerReply:
         """The model's next step; earlier feedback is in the observation's history."""
-        return self.step_batch([observation])[0]
+        return self.step_batch([observation], [self._generator])[0]
 
-    def step_batch(self, observations: Sequence[Observation]) -> list[PlannerReply]:
+    def step_batch(
+        self, observations: Sequence[Observation], states: Sequence[torch.Generator] | None = None
+    ) -> list[PlannerReply]:
         """One reply per observation; the latency is the batch's, shared equally."""
         started = time.perf_counter()
         prompts = [plan_example(one, self.model.cfg, self.motion) for one in observations]
         batch = self._collator(prompts, generation=True).to(self.model.device)
-        rows = self.model.generate(batch, self.max_new_tokens, self.temperature, self._generator)
+        rows = self.model.generate(batch, self.max_new_tokens, self.temperature, states)
         texts = self.model.processor.tokenizer.batch_decode(rows, skip_special_tokens=True)
         read = batch.attention_mask.sum(dim=1).tolist()
         each_s = (time.perf_counter() - started) / len(rows)

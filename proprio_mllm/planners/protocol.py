@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -74,10 +74,26 @@ class Planner(Protocol):
 
 @runtime_checkable
 class BatchPlanner(Protocol):
-    """Answers several episodes' observations at once, for models that run in this process."""
+    """Answers the observations of several running episodes at once, for models that run in this process.
 
-    def step_batch(self, observations: Sequence[Observation]) -> list[PlannerReply]:
-        """One reply per observation."""
+    What an episode needs to remember between its steps is in a state that `begin` makes and the caller keeps; a row's answer
+    depends on its own observation and state, not on the other rows, up to the rounding of sums.
+    """
+
+    #: Side of the square image it wants to see, pixels.
+    image_size: int
+
+    def begin(self, task: TaskInfo, rng: np.random.Generator) -> Any:
+        """The state of a new episode; `rng` is its only source of randomness."""
+        ...
+
+    def step_batch(self, observations: Sequence[Observation], states: Sequence[Any] | None = None) -> list[PlannerReply]:
+        """One reply per observation.
+
+        Args:
+            observations: one per episode; earlier feedback is in each one's history.
+            states: the episodes' states, in the same order; None only where a planner draws nothing.
+        """
         ...
 
 

@@ -14,6 +14,7 @@ import yaml
 
 from configs.compose import CONFIG_DIR
 from configs.schema.eval import ExperimentConfig
+from data.files import write_text
 from proprio_mllm.report.figures import distribution_figures, failure_figure
 from proprio_mllm.report.paper import PAPER_ROWS, paper_ablation, paper_main, paper_replanning
 from proprio_mllm.report.runs import Run, find_runs, newest
@@ -116,7 +117,8 @@ def assemble(cfg: ExperimentConfig, output: Path) -> tuple[Table | None, list[Pa
     if cfg.name in _FIGURES:
         return None, _FIGURES[cfg.name](cfg, runs, folder)
     table = _TABLES[cfg.name](cfg, runs)
-    files = [folder / f"{cfg.name}.md", folder / f"{cfg.name}.csv"]
-    files[0].write_text(table.to_markdown(), encoding="utf-8")
-    files[1].write_text(table.to_csv(), encoding="utf-8")
+    texts = {".md": table.to_markdown(), ".csv": table.to_csv(), ".tex": table.to_latex()}
+    files = [folder / f"{cfg.name}{suffix}" for suffix in texts]
+    for path, text in zip(files, texts.values(), strict=True):
+        write_text(path, text)
     return table, files

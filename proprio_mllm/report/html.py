@@ -29,6 +29,7 @@ from proprio_mllm.report.arguments import read_named
 from proprio_mllm.report.digest import episode_digest, run_digest
 from proprio_mllm.report.frames import ActedOut, act_out, episode_id
 from proprio_mllm.report.reenact import Episode, RunTasks, TaskGoneError
+from proprio_mllm.report.references import references_of
 from proprio_mllm.report.runs import Run, load_run, run_notes
 from proprio_mllm.report.summary import Row
 
@@ -113,7 +114,7 @@ def run_data(run: Run, frames: FrameChoice, size: int = 160, workers: int = 2) -
         return episode_digest(record, tasks.get(record), acted.get(name), notes.get(name, ""))
 
     episodes = tuple(digest(record) for record in (*run.records, *run.broken))
-    return RunData(run_digest(run), tuple(run.rows()), tuple(run_notes(run)), episodes, acted)
+    return RunData(run_digest(run), tuple(run.rows(references_of(run))), tuple(run_notes(run)), episodes, acted)
 
 
 #: What the list and its filters need of an episode; the rest is read when it is opened.

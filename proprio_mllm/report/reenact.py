@@ -19,7 +19,7 @@ from data.records import EpisodeRecord, Feedback, HistoryItem, Observation, Plan
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT
 from proprio_mllm.evaluation.run import plan_episodes, select_tasks
 from proprio_mllm.evaluation.seeds import episode_seed
-from proprio_mllm.evaluation.sessions import started
+from proprio_mllm.evaluation.starts import started
 from proprio_mllm.report.runs import Run
 from sim.session import Session
 from sim.tasks.task import Task
@@ -149,7 +149,7 @@ class Reenactment:
         robot = cfg.robot.spec or cfg.robot.name
         # The size of the planner's picture decides what is seen, and so what actions may name.
         self.session = Session(robot, cfg.difficulty, _picture_size(cfg.planner), cfg.contingencies)
-        self._first = self.session.reset(started(episode.task, cfg.start, episode.luck), seed=episode.luck)
+        self._first = self.session.reset(started(episode.task, cfg.start, episode.luck, robot), seed=episode.luck)
 
     def moments(self) -> Iterator[Moment]:
         """The start and every step; the session is closed at the end."""

@@ -1,83 +1,16 @@
-"""Reads runs back, and writes their reports: `summary.json`, `table.md`, `table.csv`."""
+"""Reports of runs: `summary.json` and the table as Markdown, CSV and LaTeX; and which run a cell of a bigger table shows."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
 from data.files import write_text
-from data.records import EpisodeRecord, Outcome
-from proprio_mllm.evaluation.ledger import read_ledger
-from proprio_mllm.report.summary import CATEGORIES, SUMMARY_VERSION, Row, rows_of, write_json
+from proprio_mllm.report.references import references_of
+from proprio_mllm.report.stored import Run, find_runs, load_run
+from proprio_mllm.report.summary import SUMMARY_VERSION, Row, write_json
 from proprio_mllm.report.table import Table, run_table
 
 __all__ = ["Run", "find_runs", "load_run", "newest", "run_notes", "run_report", "write_report"]
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """A run on disk.
-
-    Attributes:
-        folder: its folder.
-        metadata: `run.json`.
-        records: scored episodes of the plan, in planned order.
-        broken: infrastructure errors, every attempt.
-    """
-
-    folder: Path
-    metadata: Mapping[str, Any]
-    records: tuple[EpisodeRecord, ...]
-    broken: tuple[EpisodeRecord, ...]
-
-    @property
-    def complete(self) -> bool:
-        """Whether every planned episode is scored."""
-        return len(self.records) == len(self.metadata["planned"])
-
-    def rows(self) -> list[Row]:
-        """One row per category that was planned, and one for all."""
-        planned = {category for _, category, _, _ in self.metadata["planned"]}
-        known = [category for category in CATEGORIES if category in planned]
-        return rows_of(self.records, [*known, *sorted(planned - set(known))])
-
-    def row(self, category: str) -> Row | None:
-        """The row of one category, None when the run has no such task."""
-        return next((row for row in self.rows() if row.category == category and row.episodes), None)
-
-
-def load_run(folder: Path) -> Run:
-    """Reads a run's folder.
-
-    Raises:
-        ValueError: when it holds no run, or one of an unknown version.
-    """
-    path = folder / "run.json"
-    if not path.is_file():
-        raise ValueError(f"{folder}: no run here (run.json is missing)")
-    metadata = json.loads(path.read_text(encoding="utf-8"))
-    if metadata.get("version") != 1:
-        raise ValueError(f"{path}: run version {metadata.get('version')!r} is unknown; this code reads 1")
-    wanted = [(task, trial, own) for task, _, trial, own in metadata["planned"]]
-    scores: dict[tuple[str, int, str], EpisodeRecord] = {}
-    broken: list[EpisodeRecord] = []
-    for record in read_ledger(folder / "ledger.jsonl"):
-        if record.outcome is Outcome.INFRASTRUCTURE_ERROR:
-            broken.append(record)
-        else:
-            scores.setdefault((record.task, record.trial, record.config_hash), record)
-    return Run(folder, metadata, tuple(scores[key] for key in wanted if key in scores), tuple(broken))
-
-
-def find_runs(output: Path) -> list[Run]:
-    """All runs below `output/eval`, the newest first."""
-    paths = sorted(
-        (output / "eval").glob("*/run.json"), key=lambda path: (path.stat().st_mtime, path.parent.name), reverse=True
-    )
-    return [load_run(path.parent) for path in paths]
 
 
 def run_notes(run: Run) -> list[str]:
@@ -93,22 +26,31 @@ def run_notes(run: Run) -> list[str]:
     return notes
 
 
-def run_report(run: Run) -> Table:
-    """The table of a run."""
+def run_report(run: Run, rows: Sequence[Row] | None = None) -> Table:
+    """The table of a run.
+
+    Args:
+        run: the run.
+        rows: its rows when they have been made already.
+    """
     meta = run.metadata
-    return run_table(f"{meta['label']} · {meta['robot']} · {meta['difficulty']}", run.rows(), run_notes(run))
+    if rows is None:
+        rows = run.rows(references_of(run))
+    return run_table(f"{meta['label']} · {meta['robot']} · {meta['difficulty']}", rows, run_notes(run))
 
 
 def write_report(run: Run) -> Table:
     """Writes the report files of a run and returns its table."""
-    meta, rows, table = run.metadata, run.rows(), run_report(run)
+    meta, rows = run.metadata, run.rows(references_of(run))
+    table = run_report(run, rows)
     summary = {
         "schema_version": SUMMARY_VERSION,
         **{name: meta[name] for name in ("planner", "label", "privileged", "robot", "difficulty", "config_hash")},
         "provenance": {
             name: meta[name]
             for name in ("command", "weights", "weights_digest", "tasks", "trials", "category", "limit", "start", "seed")
-        },
+        }
+        | {"split": meta.get("split", "all")},
         "complete": run.complete,
         "planned": len(meta["planned"]),
         "infrastructure_errors": len(run.broken),
@@ -121,13 +63,14 @@ def write_report(run: Run) -> Table:
     write_json(run.folder / "summary.json", summary)
     write_text(run.folder / "table.md", table.to_markdown())
     write_text(run.folder / "table.csv", table.to_csv())
+    write_text(run.folder / "table.tex", table.to_latex())
     return table
 
 
 def newest(runs: Sequence[Run], planner: str, robot: str, difficulty: str, category: str = "all") -> Run | None:
     """The run to show in a cell: of these settings, the one with most episodes of the category, then the newest.
 
-    Runs over a part of the tasks (`limit`) or from other start poses are left out.
+    Runs over a part of the tasks (`limit`, `split`) or from other start poses are left out.
     """
     fitting = [
         run
@@ -135,6 +78,7 @@ def newest(runs: Sequence[Run], planner: str, robot: str, difficulty: str, categ
         if (run.metadata["planner"], run.metadata["robot"], run.metadata["difficulty"]) == (planner, robot, difficulty)
         and (run.metadata["tasks"], run.metadata["limit"], run.metadata["start"]) == ("benchmark", None, "fixed")
         and run.metadata["category"] in ("all", category)
+        and run.metadata.get("split", "all") == "all"
     ]
     rows = [(run, run.row(category)) for run in fitting]
     sized = [(run, row.episodes) for run, row in rows if row is not None]

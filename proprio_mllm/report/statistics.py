@@ -100,25 +100,38 @@ def rate_interval(by_task: Mapping[str, Sequence[bool]], confidence: float = 0.9
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two planners on the tasks both ran.
+    """Two sides of the same tasks.
 
     Attributes:
         tasks: number of common tasks.
-        difference: mean success of the first minus the second, over tasks.
+        first: mean of the first side, over tasks.
+        second: mean of the second side, over tasks.
+        difference: first minus second.
         low: lower limit of the difference's interval.
         high: upper limit.
-        p_value: exact sign test (McNemar's with one trial) on the tasks where they differ.
+        p_value: exact sign test (McNemar's with one trial and yes-or-no values) on the tasks where they differ.
+        above: tasks on which the first side is higher.
+        below: tasks on which it is lower.
     """
 
     tasks: int
+    first: float
+    second: float
     difference: float
     low: float
     high: float
     p_value: float
+    above: tuple[str, ...]
+    below: tuple[str, ...]
 
 
-def compare(a: Mapping[str, Sequence[bool]], b: Mapping[str, Sequence[bool]], confidence: float = 0.95) -> Comparison:
-    """Compares two planners task by task.
+def compare(a: Mapping[str, Sequence[float]], b: Mapping[str, Sequence[float]], confidence: float = 0.95) -> Comparison:
+    """Compares two sides task by task; the values of a task's trials are averaged first.
+
+    Args:
+        a: values of the trials of each task, first side.
+        b: the same, second side; tasks of one side only are left out.
+        confidence: in (0, 1).
 
     Raises:
         ValueError: when they share no task.
@@ -126,8 +139,12 @@ def compare(a: Mapping[str, Sequence[bool]], b: Mapping[str, Sequence[bool]], co
     common = sorted(task for task in a if a[task] and b.get(task))
     if not common:
         raise ValueError(f"no common task among {len(a)} and {len(b)}")
-    deltas = [float(np.mean(a[task])) - float(np.mean(b[task])) for task in common]
-    wins, losses = sum(d > 0 for d in deltas), sum(d < 0 for d in deltas)
-    p_value = float(stats.binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
+    means = {task: (float(np.mean(a[task])), float(np.mean(b[task]))) for task in common}
+    deltas = [first - second for first, second in means.values()]
+    above = tuple(task for task, (first, second) in means.items() if first > second)
+    below = tuple(task for task, (first, second) in means.items() if first < second)
+    differing = len(above) + len(below)
+    p_value = float(stats.binomtest(len(above), differing).pvalue) if differing else 1.0
     low, high = cluster_bootstrap([[d] for d in deltas], np.random.default_rng(0), confidence)
-    return Comparison(len(common), float(np.mean(deltas)), low, high, p_value)
+    first, second = (float(np.mean([pair[side] for pair in means.values()])) for side in (0, 1))
+    return Comparison(len(common), first, second, float(np.mean(deltas)), low, high, p_value, above, below)

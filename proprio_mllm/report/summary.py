@@ -15,6 +15,7 @@ broke, not scored); `seconds` (sum of `wall_s` over episodes, `planner` part); a
 | `goal_conditions` | mean share of goals met |
 | `steps`, `makespan_s`, `path_length_m`, `arm_utilisation` | means per episode |
 | `calls`, `tokens`, `planner_s` | means per episode |
+| those of `metrics.Extras` | against the expert's certificates, at `easy`, and beside the expert |
 
 A figure without an episode is null.
 """
@@ -34,6 +35,7 @@ import numpy as np
 
 from data.files import write_text
 from data.records import EpisodeRecord, FailureCategory, Outcome
+from proprio_mllm.report.metrics import Extras, References, extras_of
 from proprio_mllm.report.statistics import rate_interval
 
 __all__ = ["CATEGORIES", "SUMMARY_VERSION", "Row", "by_task", "rows_of", "write_json"]
@@ -69,14 +71,19 @@ class Row:
     calls: float
     tokens: float
     planner_s: float
+    extras: Extras
 
     def to_json(self) -> dict[str, Any]:
         """Plain form; figures without an episode are None."""
         values = dataclasses.asdict(self)
-        return {
-            name: (None if math.isnan(value) else round(value, 6)) if isinstance(value, float) else value
-            for name, value in values.items()
-        }
+        return _plain(values | values.pop("extras"))
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: (None if math.isnan(value) else round(value, 6)) if isinstance(value, float) else value
+        for name, value in values.items()
+    }
 
 
 def by_task(records: Iterable[EpisodeRecord]) -> dict[str, list[bool]]:
@@ -88,7 +95,7 @@ def by_task(records: Iterable[EpisodeRecord]) -> dict[str, list[bool]]:
     return dict(found)
 
 
-def _row(category: str, records: Sequence[EpisodeRecord]) -> Row:
+def _row(category: str, records: Sequence[EpisodeRecord], references: References) -> Row:
     def mean(of: Callable[[EpisodeRecord], float]) -> float:
         return float(np.mean([of(record) for record in records])) if records else float("nan")
 
@@ -122,14 +129,24 @@ def _row(category: str, records: Sequence[EpisodeRecord]) -> Row:
         calls=mean(lambda r: r.planner_calls),
         tokens=mean(lambda r: r.planner_tokens),
         planner_s=mean(lambda r: r.planner_s),
+        extras=extras_of(records, references),
     )
 
 
-def rows_of(records: Iterable[EpisodeRecord], categories: Sequence[str] = CATEGORIES) -> list[Row]:
-    """One row per category and one for all; infrastructure errors are not scored."""
+def rows_of(
+    records: Iterable[EpisodeRecord], categories: Sequence[str] = CATEGORIES, references: References | None = None
+) -> list[Row]:
+    """One row per category and one for all; infrastructure errors are not scored.
+
+    Args:
+        records: of one run.
+        categories: rows before the last.
+        references: what path lengths, steps and luck are measured against; nothing by default.
+    """
+    known = references or References()
     valid = [record for record in records if record.outcome is not Outcome.INFRASTRUCTURE_ERROR]
-    rows = [_row(category, [record for record in valid if record.category == category]) for category in categories]
-    return [*rows, _row("all", valid)]
+    rows = [_row(category, [record for record in valid if record.category == category], known) for category in categories]
+    return [*rows, _row("all", valid, known)]
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Tables as Markdown, CSV and terminal output, from the same cells."""
+"""Tables as Markdown, CSV, LaTeX and terminal output, from the same cells."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -14,7 +15,22 @@ from rich.table import Table as RichTable
 
 from proprio_mllm.report.summary import Row
 
-__all__ = ["Table", "rate_cell", "run_table"]
+__all__ = ["Table", "latex_text", "rate_cell", "run_table"]
+
+_LATEX: Final = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "·": r"\textperiodcentered{}",
+    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
+}
+
+
+def latex_text(text: str) -> str:
+    """Text with every sign that LaTeX would read as a command written as itself; lines become one."""
+    return "".join(_LATEX.get(sign, sign) for sign in " ".join(text.split()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +76,35 @@ class Table:
         writer.writerows(self.rows)
         return buffer.getvalue()
 
+    def to_latex(self) -> str:
+        """A `table` environment in the style of the package booktabs, which the document has to load."""
+
+        def line(cells: Sequence[str]) -> str:
+            # A group of its own: a cell that starts with a bracket is no argument of the line break before it.
+            return " & ".join("{" + text + "}" if text.startswith("[") else text for text in map(latex_text, cells)) + r" \\"
+
+        layout = "l" + "r" * (len(self.columns) - 1)
+        return (
+            "\n".join(
+                [
+                    "% needs \\usepackage{booktabs}",
+                    r"\begin{table}",
+                    r"\centering",
+                    rf"\caption{{{latex_text(self.title)}}}",
+                    rf"\begin{{tabular}}{{{layout}}}",
+                    r"\toprule",
+                    line(self.columns),
+                    r"\midrule",
+                    *(line(row) for row in self.rows),
+                    r"\bottomrule",
+                    r"\end{tabular}",
+                    *(rf"\par\footnotesize {latex_text(note)}" for note in self.notes),
+                    r"\end{table}",
+                ]
+            )
+            + "\n"
+        )
+
     def show(self, console: Console | None = None) -> None:
         """Prints notes first and the table last, so that a run ends with its rows."""
         width = sum(max(len(cell) for cell in column) + 3 for column in zip(self.columns, *self.rows, strict=True))
@@ -90,9 +135,8 @@ def run_table(title: str, rows: Sequence[Row], notes: Sequence[str] = ()) -> Tab
     """The table of one run: one row per category and one for all. Times are left out, so that equal runs give equal tables."""
     columns = (
         "category",
-        "success",
-        "%",
-        "95% interval",
+        "success %, 95 % interval",
+        "SPL",
         "navigation",
         "body adj.",
         "logical",
@@ -105,9 +149,8 @@ def run_table(title: str, rows: Sequence[Row], notes: Sequence[str] = ()) -> Tab
     body = [
         (
             row.category,
-            f"{row.successes}/{row.episodes}",
-            _number(100 * row.success_rate),
-            f"[{100 * row.low:.1f}, {100 * row.high:.1f}]" if row.episodes else "",
+            rate_cell(row),
+            _number(100 * row.extras.spl),
             str(row.navigation),
             str(row.body_adjustment),
             str(row.logical),

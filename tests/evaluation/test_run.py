@@ -100,6 +100,14 @@ def test_selection_refuses_what_is_not_there(cfg) -> None:
         select_tasks(only)
 
 
+def test_split_takes_the_tasks_of_a_split_and_names_those_there_are(cfg, task) -> None:
+    assert len(select_tasks(dataclasses.replace(cfg, split="all"))) == 4
+    for split in ("seen", "unseen"):
+        with pytest.raises(ValueError, match=f"no task of split '{split}'; its tasks are of: benchmark"):
+            select_tasks(dataclasses.replace(cfg, split=split))
+    assert "unseen" in run_folder(dataclasses.replace(cfg, split="unseen"), "").name
+
+
 def test_absent_weights_name_path_and_command(cfg, tmp_path) -> None:
     planner = PlannerConfig("proprio", "mllm", "P", str(tmp_path / "gone"), train="python train.py stage=all")
     with pytest.raises(WeightsError, match=r"gone.*python train\.py stage=all"):
@@ -169,8 +177,24 @@ def test_killed_and_resumed_gives_the_same_table(tmp_path) -> None:
     assert uninterrupted.wait(60) == 0
     (other,) = whole.glob("eval/*/ledger.jsonl")
     assert len(read_ledger(ledger)) == len(read_ledger(other)) == 24
-    for name in ("table.md", "table.csv"):
+    for name in ("table.md", "table.csv", "table.tex"):
         assert (ledger.parent / name).read_text() == (other.parent / name).read_text()
+    cut_rows, whole_rows = (json.loads((path.parent / "summary.json").read_text())["rows"] for path in (ledger, other))
+    timeless = [{name: value for name, value in row.items() if name != "planner_s"} for row in cut_rows]
+    assert timeless == [{name: value for name, value in row.items() if name != "planner_s"} for row in whole_rows]
+
+
+def test_progress_shows_what_is_left_and_success_so_far(cfg, session, capsys) -> None:
+    evaluate(dataclasses.replace(cfg, limit=1), lambda setup, job, planner: session())
+    shown = capsys.readouterr().err
+    run = evaluate(cfg, lambda setup, job, planner: session())
+    last = capsys.readouterr().err.rstrip().splitlines()[-1].split("\r")[-1]
+    solved = sum(record.outcome is Outcome.SUCCESS for record in run.records)
+    assert f"success {solved}/4" in last
+    assert "4/4 [" in last
+    assert "<" in last  # elapsed<left
+    assert "random h1 easy: 100%" in last
+    assert "/3" in shown
 
 
 def test_contingencies_of_ones_own_are_other_results(cfg, session, tmp_path, monkeypatch) -> None:

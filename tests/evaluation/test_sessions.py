@@ -12,7 +12,7 @@ from configs.schema.robot import RobotConfig
 from data.records import Outcome
 from proprio_mllm.evaluation.privileged import ExpertPlanner
 from proprio_mllm.evaluation.run import evaluate
-from proprio_mllm.evaluation.sessions import open_session, started
+from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.protocol import Planner, TaskInfo
 from proprio_mllm.planners.random_planner import RandomPlanner
 from proprio_mllm.report.runs import load_run
@@ -85,12 +85,3 @@ def test_the_expert_is_privileged_and_needs_a_session() -> None:
 
     with pytest.raises(RuntimeError, match="attach"):
         expert.reset(TaskInfo("x", "h1", 1), np.random.default_rng(0))
-
-
-def test_turned_start_changes_the_heading_only() -> None:
-    assert started(TASK, "fixed", 3) is TASK
-    turned = started(TASK, "turned", 3)
-    assert turned == started(TASK, "turned", 3)
-    assert (turned.start.x_m, turned.start.y_m) == (TASK.start.x_m, TASK.start.y_m)
-    assert turned.start.yaw_deg % 5 == 0
-    assert len({started(TASK, "turned", luck).start.yaw_deg for luck in range(12)}) > 4

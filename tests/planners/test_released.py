@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
 from data.records import Observation
+from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.mllm import MllmPlanner
 from proprio_mllm.planners.protocol import TaskInfo
 from proprio_mllm.planners.random_planner import RandomPlanner
-from sim.tasks.task import load_benchmark
+from sim.tasks.task import load_benchmark, write_tasks
 
 WEIGHTS = Path(__file__).parents[2] / "weights" / "tiny"
 #: Position embedding, cross-spatial encoder, motion tokens.
@@ -62,3 +65,16 @@ def test_it_says_where_it_comes_from(name: str) -> None:
         assert stage["command"].startswith("python train.py stage=")
         assert stage["metrics"]["seconds"] > 0
     assert name == "base" or note["variant"] == name
+
+
+def test_the_model_plans_alike_alone_and_in_a_batch(tmp_path: Path) -> None:
+    """Rows are not equal to the last bit (sums are rounded in another order); the plans are, over whole episodes."""
+    everything = load_benchmark()
+    tasks = [dataclasses.replace(everything[i * len(everything) // 3], step_budget=1 + i) for i in range(3)]
+    write_tasks(tasks, tmp_path / "tasks.jsonl")
+    planner = PlannerConfig("proprio", "mllm", "P", str(WEIGHTS / "full"))
+    cfg = EvalConfig(planner, RobotConfig("h1"), workers=0, tasks=str(tmp_path / "tasks.jsonl"), output=str(tmp_path / "1"))
+    runs = [evaluate(cfg), evaluate(dataclasses.replace(cfg, batch=3, output=str(tmp_path / "3")))]
+    alone, together = ([dataclasses.replace(r, planner_s=0.0, wall_s=0.0) for r in run.records] for run in runs)
+    assert len(alone) == 3
+    assert together == alone

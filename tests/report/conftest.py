@@ -43,6 +43,37 @@ def make_record(task: str, category: str, success: bool, trial: int = 0, **chang
     return EpisodeRecord(**(values | change))
 
 
+def store_run(folder: Path, records: list[EpisodeRecord], **change: object) -> Path:
+    """A run's folder with these records, planned and scored; `change` replaces entries of run.json."""
+    first = records[0]
+    with Ledger(folder / "ledger.jsonl") as ledger:
+        for record in records:
+            ledger.append(record)
+    meta = {
+        "version": 1,
+        "planner": first.planner,
+        "label": first.planner.title(),
+        "privileged": first.planner == "expert",
+        "robot": first.robot,
+        "difficulty": first.difficulty,
+        "contingencies": "default",
+        "category": "all",
+        "trials": 1,
+        "limit": None,
+        "start": "fixed",
+        "seed": 0,
+        "tasks": "benchmark",
+        "weights": None,
+        "weights_digest": "",
+        "config_hash": "c",
+        "command": f"python eval.py planner={first.planner} robot={first.robot}",
+        "planned": [[record.task, record.category, record.trial, record.config_hash] for record in records],
+        "config": {},
+    }
+    (folder / "run.json").write_text(json.dumps(meta | change))
+    return folder
+
+
 def make_run(output: Path, planner: str = "random", robot: str = "h1", difficulty: str = "easy", seed: int = 0) -> Path:
     rng = np.random.default_rng(seed)
     folder = output / "eval" / f"{planner}-{robot}-{difficulty}"
@@ -53,31 +84,7 @@ def make_run(output: Path, planner: str = "random", robot: str = "h1", difficult
         failure = None if success else kinds[int(rng.integers(3))]
         own = {"planner": planner, "robot": robot, "difficulty": difficulty, "failure": failure}
         records.append(make_record(f"t{i}", CATEGORIES[i % 3], success, **own))
-    with Ledger(folder / "ledger.jsonl") as ledger:
-        for record in records:
-            ledger.append(record)
-    meta = {
-        "version": 1,
-        "planner": planner,
-        "label": planner.title(),
-        "privileged": planner == "expert",
-        "robot": robot,
-        "difficulty": difficulty,
-        "category": "all",
-        "trials": 1,
-        "limit": None,
-        "start": "fixed",
-        "seed": 0,
-        "tasks": "benchmark",
-        "weights": None,
-        "weights_digest": "",
-        "config_hash": "c",
-        "command": f"python eval.py planner={planner} robot={robot}",
-        "planned": [[record.task, record.category, record.trial, record.config_hash] for record in records],
-        "config": {},
-    }
-    (folder / "run.json").write_text(json.dumps(meta))
-    return folder
+    return store_run(folder, records)
 
 
 @pytest.fixture
@@ -94,3 +101,8 @@ def run() -> Callable[..., Path]:
 def acted_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run in the simulator: what a model wrote is hostile, then the body is too low for the plant, then it is lifted."""
     return scripted_run(tmp_path_factory.mktemp("acted"))
+
+
+@pytest.fixture
+def store() -> Callable[..., Path]:
+    return store_run

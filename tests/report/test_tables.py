@@ -47,7 +47,7 @@ def test_report_files_agree_and_end_with_all(tmp_path, run) -> None:
     summary = json.loads((folder / "summary.json").read_text())
     rows = list(csv.reader(io.StringIO((folder / "table.csv").read_text())))
     for row, cells in zip(summary["rows"], rows[1:], strict=True):
-        assert cells[1] == f"{row['successes']}/{row['episodes']}"
+        assert cells[1].endswith(f" {row['successes']}/{row['episodes']}")
         assert row["navigation"] + row["body_adjustment"] + row["logical"] == row["episodes"] - row["successes"]
     assert summary["complete"]
     assert summary["provenance"]["command"].startswith("python eval.py")
@@ -81,7 +81,36 @@ def test_cell_layout(record) -> None:
     rows = rows_of([record(f"t{i}", "essential", i < 84) for i in range(133)])
     assert rate_cell(rows[2]) == "63.2 [54.7, 70.9] 84/133"
     assert rate_cell(rows[0]) == ""
-    assert run_table("t", rows).rows[2][:4] == ("essential", "84/133", "63.2", "[54.7, 70.9]")
+    assert run_table("t", rows).rows[2][:2] == ("essential", "63.2 [54.7, 70.9] 84/133")
+
+
+def test_latex_is_a_booktabs_table_with_every_sign_escaped() -> None:
+    signs = "a_b & 5 % of $1 {x} ~ ^ # <y> \\z"
+    lines = Table("50 %, h_1", ("planner", "success"), ((signs, "[1.0, 2.0]"),), ("n_1 & co",)).to_latex().splitlines()
+    assert lines[1:] == [
+        r"\begin{table}",
+        r"\centering",
+        r"\caption{50 \%, h\_1}",
+        r"\begin{tabular}{lr}",
+        r"\toprule",
+        r"planner & success \\",
+        r"\midrule",
+        r"a\_b \& 5 \% of \$1 \{x\} \textasciitilde{} \textasciicircum{} \# \textless{}y\textgreater{} "
+        r"\textbackslash{}z & {[1.0, 2.0]} \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+        r"\par\footnotesize n\_1 \& co",
+        r"\end{table}",
+    ]
+
+
+def test_latex_of_a_run_holds_the_cells(tmp_path, run) -> None:
+    folder = run(tmp_path)
+    table = write_report(load_run(folder))
+    written = (folder / "table.tex").read_text()
+    assert written.count(r"\\") == len(table.rows) + 1
+    assert rate_cell(load_run(folder).rows()[-1]) in written
+    assert "%" not in written.replace(r"\%", "").replace("% needs", "")
 
 
 def test_tables_refuse_ragged_rows() -> None:

@@ -1,0 +1,183 @@
+"""One process that holds the model, for all worker processes of this machine.
+
+Workers connect through a Unix socket with a random key; each connection is a caller of the `Batcher`, which answers up to
+`batch` of them at once. When the process dies, the calls under way become infrastructure errors, it is started anew, and the
+workers connect again at their next episode.
+
+Paper: none (engineering).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Client, Connection, Listener
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from configs.schema.eval import PlannerConfig
+from data.records import Observation
+from data.workers import start_worker
+from proprio_mllm.evaluation.batching import AskingPlanner, Batcher, batch_planner
+from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
+
+__all__ = ["ModelProcess", "SocketServer", "model_process"]
+
+logger = logging.getLogger(__name__)
+
+#: A model has to be read and its process started within this time.
+_STARTS_WITHIN_S: Final = 600.0
+_ENDS_WITHIN_S: Final = 10.0
+_POLL_S: Final = 0.05
+
+
+class _Connected:
+    """A connection that is made when it is needed, and again after it broke."""
+
+    def __init__(self, server: SocketServer) -> None:
+        self._server = server
+        self._connection: Connection[Any, Any] | None = None
+
+    def ask(self, method: str, *arguments: Any) -> Any:
+        """Calls a method of the batcher.
+
+        Raises:
+            RuntimeError: with the error's text, when the call failed there.
+            EOFError: when the process went away meanwhile.
+        """
+        if self._connection is None:
+            self._connection = _connected(self._server)
+        try:
+            self._connection.send((method, arguments))
+            fine, value = self._connection.recv()
+        except (OSError, EOFError):
+            self._connection.close()
+            self._connection = None
+            raise
+        if not fine:
+            raise RuntimeError(f"the model's process could not answer: {value}")
+        return value
+
+
+@dataclass(frozen=True, slots=True)
+class SocketServer:
+    """Where the model's process listens; can be sent to workers.
+
+    Attributes:
+        path: of the socket.
+        key: what a caller has to know.
+    """
+
+    path: str
+    key: bytes
+
+    def connect(self) -> Planner:
+        """A planner that asks the process; waits until it listens."""
+        connected = _Connected(self)
+        return AskingPlanner(connected.ask("image_size"), connected.ask)
+
+
+def _connected(server: SocketServer) -> Connection[Any, Any]:
+    deadline = time.monotonic() + _STARTS_WITHIN_S
+    while True:
+        try:
+            return Client(server.path, "AF_UNIX", server.key)
+        except (FileNotFoundError, ConnectionRefusedError):
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(_POLL_S)
+
+
+def _serve(planner: PlannerConfig, batch: int, server: SocketServer) -> None:
+    start_worker()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # ends tidily, so that nothing of it is left to clean up
+    batcher = Batcher(batch_planner(planner), batch)
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(server.path)  # of a process that died
+    with Listener(server.path, "AF_UNIX", backlog=4096, authkey=server.key) as listener:
+        number = 0
+        while True:
+            with contextlib.suppress(OSError, EOFError):  # a caller that went away while it connected
+                connection = listener.accept()
+                number += 1
+                threading.Thread(target=_answer, args=(batcher, connection, str(number)), daemon=True).start()
+
+
+def _answer(batcher: Batcher, connection: Connection[Any, Any], caller: str) -> None:
+    """Answers one caller until it goes away."""
+
+    def begin(task: TaskInfo, rng: np.random.Generator) -> None:
+        batcher.begin(caller, task, rng)
+
+    def step(observation: Observation) -> PlannerReply:
+        return batcher.step(caller, observation)
+
+    methods = {"begin": begin, "step": step, "image_size": lambda: batcher.image_size}
+    with connection, contextlib.suppress(OSError, EOFError):
+        while True:
+            method, arguments = connection.recv()
+            try:
+                answer = True, methods[method](*arguments)
+            except Exception as error:  # noqa: BLE001  # sent to the episode that it belongs to, which records it
+                answer = False, f"{type(error).__name__}: {error}"
+            connection.send(answer)
+
+
+class ModelProcess:
+    """Starts the model's process, and starts it again when it has died.
+
+    Args:
+        planner: who answers.
+        batch: most calls answered together.
+        folder: for the socket.
+    """
+
+    def __init__(self, planner: PlannerConfig, batch: int, folder: Path) -> None:
+        self.server = SocketServer(str(folder / "model"), os.urandom(32))
+        self._arguments = (planner, batch, self.server)
+        self._context = get_context("spawn")
+        self.process = self._started()
+
+    def _started(self) -> Any:
+        process = self._context.Process(target=_serve, args=self._arguments, daemon=True)
+        process.start()
+        return process
+
+    def ensure(self) -> None:
+        """Starts a new process when the last one is gone."""
+        if not self.process.is_alive():
+            logger.warning("the model's process died (exit code %s); starting a new one", self.process.exitcode)
+            self.process = self._started()
+
+    def stop(self) -> None:
+        """Ends the process."""
+        self.process.terminate()
+        self.process.join(_ENDS_WITHIN_S)
+        self.process.kill()
+        self.process.join()
+
+
+@contextlib.contextmanager
+def model_process(planner: PlannerConfig, batch: int) -> Iterator[ModelProcess]:
+    """A model's process for the time of the block."""
+    folder = Path(tempfile.mkdtemp(prefix="proprio-"))
+    try:
+        model = ModelProcess(planner, batch, folder)
+        try:
+            yield model
+        finally:
+            model.stop()
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

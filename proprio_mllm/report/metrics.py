@@ -1,0 +1,160 @@
+"""Figures of episodes beyond success: path-length weighting, steps against the expert's, recovery from bad luck, regret.
+
+With S the success of an episode (0 or 1), l the length of the base's path in the certificate and p the episode's own:
+
+* SPL: mean of S · l' / max(p', l') with l' = max(l, 0.1 m) and p' = max(p, 0.1 m). Certificates are rounded to 0.1 m, and some
+  tasks need no walking at all: below 0.1 m a path counts as 0.1 m, so that standing still on a task without a way gives 1 and
+  walking there costs. The expert's path is not proven shortest; a shorter own path counts as 1.
+* step optimality: mean of certificate steps / own steps over successes; above 1 where an episode needed fewer steps.
+* recovery: an event is an action whose draw of the contingency was not success. It is recovered when its episode succeeds, and
+  made good when the same verb on the same object succeeds later in the episode, with either arm (the rule of `attribution`).
+* regret: success of the same planner in the same episodes at `easy` minus success here; and mean own steps minus the expert's
+  over episodes that both solved at this difficulty with this luck.
+
+Paper: path-length weighting after Anderson et al. 2018; none of these is in the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from data.records import Action, ActionError, EpisodeRecord, Outcome
+from proprio_mllm.report.statistics import cluster_bootstrap
+
+__all__ = ["Certificate", "Extras", "References", "extras_of", "path_efficiency", "recoveries"]
+
+SHORTEST_M: Final = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """The expert's plan for a task: its number of steps and the length of the base's path in metres."""
+
+    steps: int
+    path_length_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class References:
+    """What is known besides the run itself; empty where there is nothing to compare with.
+
+    Attributes:
+        certificates: by task, for the run's robot.
+        easy: whether the same planner succeeded in the same episode at `easy`, by task and trial.
+        expert: the expert's steps in the same episode at the same difficulty, where it succeeded, by task and trial.
+    """
+
+    certificates: Mapping[str, Certificate] = field(default_factory=dict)
+    easy: Mapping[tuple[str, int], bool] = field(default_factory=dict)
+    expert: Mapping[tuple[str, int], int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Extras:
+    """The figures of some episodes; NaN where there is nothing to count. See the module for the definitions.
+
+    Attributes:
+        certified: episodes with a certificate.
+        spl, spl_low, spl_high: over the certified episodes, with a cluster bootstrap over tasks (95 %).
+        step_optimality: over the certified successes.
+        contingencies: events.
+        recovery, made_good: shares of the events.
+        regret_episodes: episodes that the same planner also ran at `easy`.
+        regret: over those.
+        regret_steps_episodes: episodes that both this planner and the expert solved.
+        regret_steps: over those.
+    """
+
+    certified: int
+    spl: float
+    spl_low: float
+    spl_high: float
+    step_optimality: float
+    contingencies: int
+    recovery: float
+    made_good: float
+    regret_episodes: int
+    regret: float
+    regret_steps_episodes: int
+    regret_steps: float
+
+
+def path_efficiency(own_m: float, shortest_m: float) -> float:
+    """l' / max(p', l') in (0, 1]; see the module.
+
+    Raises:
+        ValueError: on a negative length.
+    """
+    if own_m < 0.0 or shortest_m < 0.0:
+        raise ValueError(f"path lengths must not be negative, got {own_m} and {shortest_m} m")
+    shortest = max(shortest_m, SHORTEST_M)
+    return shortest / max(own_m, shortest)
+
+
+def recoveries(trace: Sequence[Mapping[str, Any]]) -> list[bool]:
+    """Per contingency event of an episode, in order, whether the action was made good later."""
+    done: set[tuple[str, str | None]] = set()
+    found: list[bool] = []
+    for step in reversed(trace):
+        for outcome in reversed(step["outcomes"]):
+            try:
+                action = Action.parse(outcome["action"])
+            except ActionError:
+                continue  # a reply outside the grammar, today's or that of the ledger's time
+            key = (action.name, action.object_id)
+            if outcome["contingency"] not in ("", "success"):
+                found.append(key in done)
+            if outcome["ok"]:
+                done.add(key)
+    return found[::-1]
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")
+
+
+def _spl(records: Sequence[EpisodeRecord], certificates: Mapping[str, Certificate]) -> tuple[float, float, float]:
+    clusters: dict[str, list[float]] = {}
+    for record in records:
+        won = record.outcome is Outcome.SUCCESS
+        share = path_efficiency(record.path_length_m, certificates[record.task].path_length_m) if won else 0.0
+        clusters.setdefault(record.task, []).append(share)
+    if not clusters:
+        return float("nan"), float("nan"), float("nan")
+    low, high = cluster_bootstrap([clusters[task] for task in sorted(clusters)], np.random.default_rng(0))
+    return _mean([value for values in clusters.values() for value in values]), low, high
+
+
+def extras_of(records: Sequence[EpisodeRecord], references: References) -> Extras:
+    """The figures of some episodes.
+
+    Args:
+        records: scored episodes.
+        references: what they are measured against.
+    """
+    certificates, easy, expert = references.certificates, references.easy, references.expert
+    won = {(record.task, record.trial): record.outcome is Outcome.SUCCESS for record in records}
+    certified = [record for record in records if record.task in certificates]
+    spl, low, high = _spl(certified, certificates)
+    events = [(won[record.task, record.trial], good) for record in records for good in recoveries(record.trace)]
+    at_easy = [float(easy[key]) - float(success) for key, success in won.items() if key in easy]
+    solved = [record for record in records if won[record.task, record.trial]]
+    to_expert = [r.steps - expert[r.task, r.trial] for r in solved if (r.task, r.trial) in expert]
+    return Extras(
+        certified=len(certified),
+        spl=spl,
+        spl_low=low,
+        spl_high=high,
+        step_optimality=_mean([certificates[r.task].steps / r.steps for r in solved if r.task in certificates]),
+        contingencies=len(events),
+        recovery=_mean([float(success) for success, _ in events]),
+        made_good=_mean([float(good) for _, good in events]),
+        regret_episodes=len(at_easy),
+        regret=_mean(at_easy),
+        regret_steps_episodes=len(to_expert),
+        regret_steps=_mean(to_expert),
+    )

@@ -1,0 +1,102 @@
+"""Reads runs back from their folders."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from data.records import EpisodeRecord, Outcome
+from proprio_mllm.evaluation.ledger import read_ledger
+from proprio_mllm.report.metrics import References
+from proprio_mllm.report.summary import CATEGORIES, Row, rows_of
+
+__all__ = ["Run", "find_runs", "load_run", "read_metadata"]
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A run on disk.
+
+    Attributes:
+        folder: its folder.
+        metadata: `run.json`.
+        records: scored episodes of the plan, in planned order.
+        broken: infrastructure errors, every attempt.
+    """
+
+    folder: Path
+    metadata: Mapping[str, Any]
+    records: tuple[EpisodeRecord, ...]
+    broken: tuple[EpisodeRecord, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every planned episode is scored."""
+        return len(self.records) == len(self.metadata["planned"])
+
+    @property
+    def robot_config(self) -> Mapping[str, Any]:
+        """The robot's configuration; empty for a run without one."""
+        return self.metadata["config"].get("robot", {})
+
+    def contents(self) -> dict[str, str]:
+        """Hash of each planned task's content, by task id."""
+        return {task: own.rpartition("-")[2] for task, _, _, own in self.metadata["planned"]}
+
+    def rows(self, references: References | None = None) -> list[Row]:
+        """One row per category that was planned, and one for all.
+
+        Args:
+            references: what path lengths, steps and luck are measured against; nothing by default.
+        """
+        planned = {category for _, category, _, _ in self.metadata["planned"]}
+        known = [category for category in CATEGORIES if category in planned]
+        return rows_of(self.records, [*known, *sorted(planned - set(known))], references)
+
+    def row(self, category: str) -> Row | None:
+        """The row of one category, None when the run has no such task."""
+        return next((row for row in self.rows() if row.category == category and row.episodes), None)
+
+
+def read_metadata(folder: Path) -> dict[str, Any]:
+    """Contents of a run's `run.json`.
+
+    Raises:
+        ValueError: when the folder holds no run, or one of an unknown version.
+    """
+    path = folder / "run.json"
+    if not path.is_file():
+        raise ValueError(f"{folder}: no run here (run.json is missing)")
+    metadata = json.loads(path.read_text(encoding="utf-8"))
+    if metadata.get("version") != 1:
+        raise ValueError(f"{path}: run version {metadata.get('version')!r} is unknown; this code reads 1")
+    return metadata
+
+
+def load_run(folder: Path) -> Run:
+    """Reads a run's folder.
+
+    Raises:
+        ValueError: when it holds no run, or one of an unknown version.
+    """
+    metadata = read_metadata(folder)
+    wanted = [(task, trial, own) for task, _, trial, own in metadata["planned"]]
+    scores: dict[tuple[str, int, str], EpisodeRecord] = {}
+    broken: list[EpisodeRecord] = []
+    for record in read_ledger(folder / "ledger.jsonl"):
+        if record.outcome is Outcome.INFRASTRUCTURE_ERROR:
+            broken.append(record)
+        else:
+            scores.setdefault((record.task, record.trial, record.config_hash), record)
+    return Run(folder, metadata, tuple(scores[key] for key in wanted if key in scores), tuple(broken))
+
+
+def find_runs(output: Path) -> list[Run]:
+    """All runs below `output/eval`, the newest first."""
+    paths = sorted(
+        (output / "eval").glob("*/run.json"), key=lambda path: (path.stat().st_mtime, path.parent.name), reverse=True
+    )
+    return [load_run(path.parent) for path in paths]
