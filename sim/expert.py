@@ -39,10 +39,15 @@ _PATIENCE: Final = 5
 _HEIGHT_TRIALS: Final = 2
 #: Height above a surface at which a load is carried towards it.
 _OVER_EDGE_M: Final = 0.04
+#: Step back from what a walk ran into, and how often that helps.
+_BACK_M: Final = 0.2
+_RETREATS: Final = 2
 #: Looks around for an object that should be near, before giving up.
 _LOOKS: Final = 6
 #: Objects lower than this lie on the floor, out of reach.
 _FLOOR_M: Final = 0.35
+#: Targets that are farther apart than this are not for both arms at once.
+_TOGETHER_M: Final = 0.9
 #: Farther away than this, an arm need not be asked.
 _FAR_M: Final = 1.1
 #: Names of actions that change the stance or the height.
@@ -202,7 +207,8 @@ class Expert:
                 self._memory.refusals.append(refusal)
             if refusal.verdict is not None:
                 verdicts.append(refusal.verdict)
-        return _single(self._approach(head, verdicts, facts))
+        together = self._approach_together(head, jobs[1:], facts)
+        return _single(together or self._approach(head, verdicts, facts))
 
     # ---- memory
 
@@ -327,11 +333,60 @@ class Expert:
                     return option
         return Action("Done")
 
+    def _approach_together(self, head: Job, others: Sequence[Job], facts: Facts) -> Action | None:
+        """A walk to where both arms can work at once, None when there is nothing for the other arm or no such place.
+
+        It is thought about once for every pair of targets.
+        """
+        partner = next((job for job in others if self._goes_with(head, job)), None)
+        if partner is None or head.then is not None or self._count(f"together {head.target} {partner.target}"):
+            return None
+        pairs = [
+            (head.action(arm), partner.action(arm.other))
+            for arm in self._usable
+            if head.arm in (None, arm) and partner.arm in (None, arm.other) and arm.other in self._usable
+        ]
+        present, *heights = self._rehearsal.heights_m()
+        options: list[tuple[Action, Stance]] = []
+        for target in dict.fromkeys((head.target, partner.target)):
+            for distance, bearing in _STANCES[:3]:
+                option = Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
+                stance = self._rehearsal.stance_of(option)
+                if stance is not None:
+                    options.append((option, stance))
+        for height in (present, *heights[:4]):
+            for option, stance in options:
+                if self._rehearsal.works_together(pairs, stance, height):
+                    return option
+        return None
+
+    def _stuck(self) -> bool:
+        """Whether the last walk ended at an obstacle and there is room to step back from it."""
+        history, body = self._session.history, self._session.body
+        if not history or not history[-1].feedback.endswith(FailureCode.BLOCKED_PATH.value):
+            return False
+        base = body.commanded_base()
+        behind = base.position - _BACK_M * np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
+        return not history[-1].step.startswith("Move") and body.navigation().free_travel(base.position, behind) > 0.9 * _BACK_M
+
+    def _goes_with(self, head: Job, other: Job) -> bool:
+        """Whether two jobs might be done at once, by one arm each."""
+        arm_jobs = head.arm is None or other.arm is None or head.arm is not other.arm
+        if not other.target or other.then is not None or not arm_jobs or {head.verb, other.verb} & {"Lift", "PlaceBoth"}:
+            return False
+        if other.target not in self._session.known_objects:
+            return False
+        body = self._session.body
+        gap = body.interaction_point(head.target)[:2] - body.interaction_point(other.target)[:2]
+        return len(self._usable) == 2 and float(np.hypot(*gap)) < _TOGETHER_M
+
     def _approach(self, job: Job, verdicts: Sequence[SkillFailure], facts: Facts) -> Action:
         """The body action that brings a known target into reach."""
         at_door = next((arm for arm, item in facts.held.items() if item is not None and facts.in_place(item)), None)
         if at_door is not None:  # a hand that holds something where it is keeps the robot there
             return Action("Release", arm=at_door)
+        if self._stuck() and self._count("back off") < _RETREATS:
+            return Action("MoveBack", amount=_BACK_M)
         if job.then is not None:
             return self._approach_for_two(job, facts)
         target = job.target

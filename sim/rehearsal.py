@@ -68,6 +68,18 @@ class Rehearsal:
             world.restore(saved)
         return False
 
+    def works_together(self, pairs: Sequence[tuple[Action, Action]], stance: Stance, height_m: float) -> bool:
+        """Whether two actions would both be tried from a stance at a height, for one of some choices of arms."""
+        world, body = self._session.world, self._session.body
+        saved = world.save()
+        body.hurried = True
+        try:
+            self._put(stance, height_m)
+            return any(all(self._session.assess(action) is None for action in pair) for pair in pairs)
+        finally:
+            body.hurried = False
+            world.restore(saved)
+
     def leads_to(self, first: Action, then: Action, stance: Stance | None = None, height_m: float | None = None) -> bool:
         """Whether an action would be tried after another one has been acted out.
 
