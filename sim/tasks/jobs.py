@@ -190,7 +190,9 @@ def _all_leaves(goals: Sequence[Predicate]) -> list[Predicate]:
 def _strays(goals: Sequence[Predicate], leaves: Sequence[Predicate], light: Sequence[Predicate], facts: Facts) -> list[Job]:
     """Putting away, or letting go of, what no goal wants in a hand."""
     kept = {goal.object_id for goal in _all_leaves(goals) if goal.kind == "held"} | {leaf.object_id for leaf in light}
-    kept |= {leaf.object_id for leaf in leaves if leaf.kind == "filled"}
+    if any(leaf.kind == "filled" for leaf in leaves):  # the vessel, and what it may be filled from
+        kept |= {leaf.object_id for leaf in leaves if leaf.kind == "filled"}
+        kept |= {item for item in facts.held.values() if item is not None and facts.objects[item]["isFilledWithLiquid"]}
     for leaf in leaves:
         if leaf.kind in _TOOL_WORK:
             kept |= {leaf.object_id, *facts.tools.get(_TOOL_WORK[leaf.kind][0], ())}
