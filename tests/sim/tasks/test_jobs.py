@@ -112,13 +112,14 @@ def kitchen(held=None, arms=(RIGHT, LEFT), **states):
             ("isOpen", "isToggled", "isFilledWithLiquid", "isSliced", "isCooked", "isDirty", "isUsedUp"), False
         ) | states.get(name, {})  # fmt: skip
     tools = {"cutter": ("Knife_1",), "wiper": ("Sponge_1",)}
-    return Facts(objects, hands, None, frozenset(), places, frozenset(), tools, frozenset({"Apple_1", "Plate_1"}), ("Faucet_1",),
-                 {"Sink_1": "Faucet_1"}, arms)  # fmt: skip
+    unsteady, switches = frozenset({"Apple_1", "Plate_1"}), {"Sink_1": "Faucet_1"}
+    return Facts(objects, hands, None, frozenset(), places, frozenset(), tools, unsteady, ("Faucet_1",), switches, arms)
 
 
 SLICED, CLEAN, FILLED = Predicate("sliced", "Apple_1"), Predicate("clean", "Plate_1"), Predicate("filled", "Mug_1")
 STORED = [Predicate("in", "Mug_1", "Drawer_1"), Predicate("closed", "Drawer_1")]
 FETCHED = [Predicate("held", "Egg_1"), Predicate("closed", "Drawer_1")]
+COOKED, INSIDE = Predicate("cooked", "Egg_1"), {"parentReceptacles": ["Microwave_1"]}
 DIRTY = {"Plate_1": {"isDirty": True}}
 OPEN = {"Drawer_1": {"isOpen": True}}
 WORK = Job("Slice", "Apple_1", RIGHT)
@@ -138,11 +139,9 @@ WORK = Job("Slice", "Apple_1", RIGHT)
         ([FILLED], kitchen(Jug_1={"isFilledWithLiquid": True}), [Job("Pick", "Jug_1")]),
         ([FILLED], kitchen({LEFT: "Jug_1"}, Jug_1={"isFilledWithLiquid": True}), [Job("Pour", "Mug_1", LEFT)]),
         ([Predicate("used_up", "Jug_1")], kitchen(), [Job("UseUp", "Jug_1")]),
-        ([Predicate("cooked", "Egg_1")],
-         kitchen(Egg_1={"parentReceptacles": ["Microwave_1"]}, Microwave_1={"isOpen": True}), [Job("Close", "Microwave_1")]),
-        ([Predicate("cooked", "Egg_1")], kitchen(Egg_1={"parentReceptacles": ["Microwave_1"]}), [Job("ToggleOn", "Microwave_1")]),
-        ([Predicate("cooked", "Egg_1")],
-         kitchen(Egg_1={"parentReceptacles": ["Microwave_1"]}, Microwave_1={"isToggled": True}), [Job("ResetArm", "", RIGHT)]),
+        ([COOKED], kitchen(Egg_1=INSIDE, Microwave_1={"isOpen": True}), [Job("Close", "Microwave_1")]),
+        ([COOKED], kitchen(Egg_1=INSIDE), [Job("ToggleOn", "Microwave_1")]),
+        ([COOKED], kitchen(Egg_1=INSIDE, Microwave_1={"isToggled": True}), [Job("ResetArm", "", RIGHT)]),
         (STORED, kitchen({RIGHT: "Mug_1"}), [Job("Open", "Drawer_1", then=Job("Place", "Drawer_1", RIGHT))]),
         (STORED, kitchen({RIGHT: "Mug_1", LEFT: "Drawer_1"}, **OPEN), [Job("Place", "Drawer_1", RIGHT)]),
         (STORED, kitchen({LEFT: "Drawer_1"}, Mug_1={"parentReceptacles": ["Drawer_1"]}, **OPEN), [Job("Release", "", LEFT)]),
