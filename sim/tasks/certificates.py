@@ -26,6 +26,7 @@ __all__ = [
     "Certificate",
     "Refusal",
     "budget_of",
+    "certificates_table",
     "certificates_text",
     "certified",
     "certify",
@@ -161,6 +162,29 @@ def certified(task: Task, robots: Sequence[str] = ROBOTS) -> tuple[Task, tuple[C
 def certificates_text(certificates: Iterable[Certificate]) -> str:
     """One JSON object per line, byte-stable."""
     return "".join(json.dumps(certificate.to_json()) + "\n" for certificate in certificates)
+
+
+def certificates_table(tasks: Sequence[Task], certificates: Sequence[Certificate]) -> str:
+    """Markdown: per family and robot the means of steps, makespan, path, use of the arms, and least steps of one arm."""
+    family = {task.id: (task.category, task.family) for task in tasks}
+    rows: dict[tuple[str, str, str], list[Certificate]] = {}
+    for proof in certificates:
+        rows.setdefault((*family[proof.task], proof.robot), []).append(proof)
+    lines = [
+        "| category | family | robot | tasks | steps | one arm | makespan (s) | path (m) | arms in use |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for (category, name, robot), proofs in rows.items():
+        alone = [min(done) for done in ([n for n in p.one_arm_steps.values() if n is not None] for p in proofs) if done]
+        figures = [
+            f"{np.mean([len(p.plan) for p in proofs]):.1f}",
+            f"{np.mean(alone):.1f}" if alone else "none",
+            f"{np.mean([p.makespan_s for p in proofs]):.1f}",
+            f"{np.mean([p.path_length_m for p in proofs]):.1f}",
+            f"{100.0 * np.mean([p.arm_utilisation for p in proofs]):.0f} %",
+        ]
+        lines.append(f"| {category} | {name} | {robot} | {len(proofs)} | " + " | ".join(figures) + " |")
+    return "\n".join(lines) + "\n"
 
 
 def load_certificates() -> tuple[Certificate, ...]:

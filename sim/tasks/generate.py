@@ -3,6 +3,7 @@
     python -m sim.tasks.generate               # writes benchmark.jsonl and certificates.jsonl
     python -m sim.tasks.generate --check       # rebuilds every task from its seed, solves it again, compares bytes
     python -m sim.tasks.generate --check-fast  # the same without solving: budgets are taken as they are
+    python -m sim.tasks.generate --table       # the certificates per family and robot, as Markdown
 
 A slot is a family in a room. Its seeds are tried in order, and those tasks are kept whose certificates say what their category
 promises (`sim.tasks.certificates`), whose instruction is new, and whose subject has not yet been asked for too often. Both
@@ -34,8 +35,10 @@ from sim.tasks.certificates import (
     CERTIFICATES_PATH,
     Certificate,
     Refusal,
+    certificates_table,
     certificates_text,
     certified,
+    load_certificates,
 )
 from sim.tasks.composition import COMPOSITION, Share
 from sim.tasks.sample import sample_task
@@ -263,10 +266,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     group = parser.add_mutually_exclusive_group()
     group.add_argument("--check", action="store_true", help="solve every task again and compare the files")
     group.add_argument("--check-fast", action="store_true", help="draw every task again and compare the files")
+    group.add_argument("--table", action="store_true", help="print the certificates per family and robot")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--tried", type=Path, default=None, help="folder of what has been tried; outputs/tasks/HASH by default")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    if options.table:
+        sys.stdout.write(certificates_table(load_benchmark(), load_certificates()))
+        return 0
     if options.check or options.check_fast:
         problems = list(_check(solve=options.check))
         sys.stdout.write(json.dumps(counts(load_benchmark())) + "\n")

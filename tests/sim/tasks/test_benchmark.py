@@ -76,6 +76,13 @@ def test_counts_are_printed_as_json():
     assert found["tasks"] == 359 and sum(found["room"].values()) == 359 and set(found["split"]) == {"seen", "unseen"}
 
 
+def test_the_table_has_a_row_per_family_and_robot(capsys):
+    assert main(["--table"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 + 2 * len({task.family for task in TASKS})
+    assert all(line.count("|") == 10 for line in lines)
+
+
 def test_budgets():
     assert budget_of([3, 4]) == 8
     assert budget_of([40]) == 50
