@@ -60,7 +60,7 @@ class Belief:
         switches: whether something is switched on.
         at: where something was put.
         done: (`sliced` …, id) that has been brought about.
-        here: what the robot went to last.
+        here: what the robot went to last, None after it has stepped aside.
         visited: everything it went to.
         heavy, light: what needs both hands; what cannot be lifted with both.
         self_closing: doors that fall shut.
@@ -170,6 +170,8 @@ class Belief:
             self.here = target
             self.visited.add(target)
             self.blocked = 0
+        elif name.startswith("Move") and name not in _LEGS:
+            self.here = None
         if name in _BASE or name in _LEGS or name == "ResetArm":
             return
         self.fails.clear()

@@ -1,7 +1,7 @@
 """The words between the things of an instruction: idioms become verbs, things that are named together become groups.
 
-`put <0> and <1> on <2> , which is closed` becomes `put <0+1> on <2>`. What is said beside, such as that both hands are needed or
-that a door falls shut, is taken out of the text and kept as a fact. Paper: not in it; part of a reference planner.
+`put <0> and <1> on <2> , which is closed` becomes `put <0+1> on <2>`. What is said beside, such as that both hands are needed
+or that a door falls shut, is taken out of the text and kept as a fact. Paper: not in it; part of a reference planner.
 """
 
 from __future__ import annotations

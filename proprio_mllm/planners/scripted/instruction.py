@@ -1,8 +1,8 @@
 """What an instruction asks for: its clauses turned into goals, by key words and their order.
 
 Verbs are read from left to right: a verb takes the things after it, a preposition the place after it, `it` what was spoken of
-last. What is only a means to something else that is asked for is no goal: fetching what shall be put down, opening what something
-is put into.
+last. What is only a means to something else that is asked for is no goal: fetching what shall be put down, opening what
+something is put into.
 
 Paper: natural-language instructions of the DualTHOR tasks; the reading is a reference planner's, not the paper's.
 """

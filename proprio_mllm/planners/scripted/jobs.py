@@ -215,6 +215,8 @@ def _carry(light: Sequence[Want], belief: Belief) -> list[Job]:
     """Carrying small things: the hands are filled first, but one stays free for a door that is still shut."""
     in_hand = [want for want in light if belief.arm_with(want.thing) is not None]
     waiting = [want for want in light if want not in in_hand]
+    if in_hand:  # what may be anywhere is not searched with full hands
+        waiting = [want for want in waiting if want.thing is not None or want.source is not None]
     free = belief.free_arms()
     door_ahead = any(_is_shut(want.place, belief) for want in in_hand)
     if waiting and free and not door_ahead:

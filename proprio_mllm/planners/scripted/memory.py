@@ -20,7 +20,7 @@ _SURFACES: Final = ("countertop", "diningtable", "coffeetable", "sidetable", "de
 _SEATS: Final = ("sofa", "bed", "chair", "stoveburner", "sinkbasin", "bathtubbasin", "toilet", "garbagecan")
 _CONTAINERS: Final = ("cabinet", "drawer", "fridge", "microwave", "laundryhamper", "box")
 #: How to look around at a place: names and amounts.
-_LOOKS: Final = (("RotateLeft", 45.0), ("RotateRight", 90.0), ("MoveBack", 0.3))
+_LOOKS: Final = (("RotateLeft", 45.0), ("RotateRight", 90.0), ("MoveBack", 0.3), ("RotateLeft", 45.0), ("MoveUp", 0.2))
 
 
 class Memory:

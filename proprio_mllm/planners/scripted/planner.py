@@ -35,7 +35,7 @@ _RISES_M: Final = (0.1, 0.15, 0.15)
 _ASIDE: Final = (("MoveBack", 0.3), ("MoveBack", 0.15), ("MoveRight", 0.25), ("MoveLeft", 0.25))
 _ASIDE_NAMES: Final = ("MoveBack", "MoveRight", "MoveLeft")
 #: Failures of one action after which it is given up.
-_PATIENCE: Final = 9
+_PATIENCE: Final = 16
 #: Codes after which the same thing may work when it is tried again.
 _BAD_LUCK: Final = ("NothingHappened", "Locked", "Slipped", "Spilled")
 #: Codes that a better knowledge of the world answers: what comes next is another job.
