@@ -22,6 +22,9 @@ _CONTAINERS: Final = ("cabinet", "drawer", "fridge", "microwave", "laundryhamper
 #: How to look around at a place: names and amounts.
 _LOOKS: Final = (("RotateLeft", 45.0), ("RotateRight", 90.0), ("MoveBack", 0.3), ("RotateLeft", 45.0), ("MoveUp", 0.2))
 
+#: How often a walk that was blocked is taken again.
+_PATIENCE: Final = 4
+
 
 class Memory:
     """What an episode has shown.
@@ -41,6 +44,7 @@ class Memory:
         self._found_at: dict[str, str | None] = {}
         self._meant: dict[tuple[Mention, int], str] = {}
         self._tried: Action | None = None
+        self._blocked_before = self._blocked_then = 0
         self._ways: dict[Mention, list[Action]] = {}
 
     def look(self, observation: Observation) -> None:
@@ -94,15 +98,22 @@ class Memory:
         if mention not in self._ways:
             self._ways[mention] = self._round(mention)
         ways = self._ways[mention]
-        if self._tried is not None and self.belief.failures(self._tried.name, self._tried.object_id):
-            ways.insert(0, self._tried)  # it was blocked; once more
-            self._tried = None
-            return ways.pop(0)
+        if self._tried is not None:
+            blocked = len(self._blocked(self._tried))
+            patience = _PATIENCE if self._tried.name == "GoTo" else 1
+            if self._blocked_then < blocked <= self._blocked_before + patience:
+                self._blocked_then = blocked
+                return self._tried
         while ways:
             action = self._tried = ways.pop(0)
             if action.name != "Open" or (action.object_id and self.belief.doors.get(action.object_id) is not True):
+                self._blocked_before = self._blocked_then = len(self._blocked(action))
                 return action
         return Action("Done")
+
+    def _blocked(self, action: Action) -> list[str]:
+        events = self.belief.failures(action.name, action.object_id)
+        return [event.code for event in events if event.code == "BlockedPath"]
 
     def _round(self, mention: Mention) -> list[Action]:
         named = None if mention.place is None else self.find(mention.place)
@@ -110,7 +121,7 @@ class Memory:
         for group in (_SURFACES, _SEATS, _CONTAINERS):
             names = sorted(name for name in self._known if type_of(name) in group and name != named)
             order += [names[int(index)] for index in self._rng.permutation(len(names))]
-        steps = [Action("RotateLeft", amount=90.0)] * 3 if named is None else []
+        steps = [] if named is not None else [Action("MoveUp", amount=0.2), *[Action("RotateLeft", amount=90.0)] * 3]
         for name in order:
             steps.append(Action("GoTo", object_id=name))
             free = self.belief.free_arms()

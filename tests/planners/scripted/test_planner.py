@@ -202,12 +202,23 @@ def test_search_looks_around_then_visits_the_furniture() -> None:
         return lines
 
     found = texts(0)
-    assert found[0].startswith("Rotate")
+    assert found[0].startswith("MoveUp")
+    assert found[1].startswith("Rotate")
     assert {"GoTo(CounterTop_1) ok", "GoTo(SideTable_1) ok", "GoTo(Fridge_1) ok"} <= set(found)
     assert any(line.startswith("Open(") and "Fridge_1" in line for line in found)
     assert found[-1] == "Done() ok"
     assert texts(0) == found
     assert any(texts(seed) != found for seed in range(1, 6))
+
+
+def test_a_blocked_look_is_taken_once_more_and_no_later_one_twice() -> None:
+    planner = ScriptedPlanner()
+    planner.reset(TaskInfo("", "h1", 40), np.random.default_rng(0))
+    lines: list[str] = []
+    for code in ("ok", "BlockedPath", "ok", "ok", "ok", "ok", "ok"):
+        lines.append(f"{answer('Pick up the vase.', lines, (), planner)} {code}")
+    names = [line.partition("(")[0] for line in lines]
+    assert names == ["MoveUp", "RotateLeft", "MoveBack", "RotateLeft", "RotateLeft", "RotateLeft", "GoTo"]
 
 
 @pytest.mark.parametrize("text", ["", "hello", "x" * 10_000, "the " * 3_000, "put it in it", "Juggle the mug."])
