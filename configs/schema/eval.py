@@ -37,8 +37,8 @@ class PlannerConfig:
 
     Attributes:
         name: name in commands, ledgers and tables.
-        kind: `mllm` runs a stored model, `file` a class in a Python file, `random` draws legal actions, `expert` looks into the
-            simulator (privileged).
+        kind: `mllm` runs a stored model, `file` a class in a Python file, `random` draws legal actions, `scripted` follows
+            rules, `expert` looks into the simulator (privileged).
         label: name printed in tables.
         weights: folder of a stored model; needed for `mllm`.
         source: `FILE.py:CLASS`; needed for `file`.
@@ -50,7 +50,7 @@ class PlannerConfig:
     """
 
     name: str
-    kind: Literal["mllm", "file", "random", "expert"]
+    kind: Literal["mllm", "file", "random", "scripted", "expert"]
     label: str
     weights: str | None = None
     source: str | None = None

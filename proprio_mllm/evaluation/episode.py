@@ -48,7 +48,7 @@ class GoalReport:
 
     Attributes:
         met: one entry per goal.
-        unmet_objects: ids named in goals that do not hold.
+        unmet_objects: ids that goals which do not hold are about (`attribution.unmet_objects`).
     """
 
     met: tuple[bool, ...]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -11,7 +12,16 @@ from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 from sim.expert import Expert
 from sim.session import Session
 
-__all__ = ["ExpertPlanner"]
+__all__ = ["ExpertPlanner", "PrivilegedPlanner"]
+
+
+@runtime_checkable
+class PrivilegedPlanner(Protocol):
+    """A planner that is given the session of the coming episode."""
+
+    def attach(self, session: Session) -> None:
+        """Takes the session."""
+        ...
 
 
 class ExpertPlanner:

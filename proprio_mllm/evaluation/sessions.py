@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from configs.schema.eval import DifficultyName, StartName
 from configs.schema.robot import RobotConfig
 from data.records import Feedback, Observation, PlanStep
+from proprio_mllm.evaluation.attribution import unmet_objects
 from proprio_mllm.evaluation.episode import GoalReport, RunnableSession, Stats
 from proprio_mllm.evaluation.starts import started
 from proprio_mllm.planners.protocol import Planner
@@ -43,9 +44,7 @@ class SimSession:
         """Which goals hold now."""
         metadata = self.session.world.metadata()
         met = tuple(goal.holds(metadata) for goal in self.task.goals)
-        ids = tuple(entry["objectId"] for entry in metadata["objects"])
-        unmet = {name for goal, holds in zip(self.task.goals, met, strict=True) if not holds for name in goal.involved(ids)}
-        return GoalReport(met, frozenset(unmet))
+        return GoalReport(met, unmet_objects(self.task, met))
 
     def stats(self) -> Stats:
         """Costs so far."""
@@ -98,9 +97,9 @@ def open_session(
         _sessions[key] = Session(_described(robot), difficulty, planner.image_size, contingency)
     session = _sessions[key]
     if planner.privileged:
-        from proprio_mllm.evaluation.privileged import ExpertPlanner
+        from proprio_mllm.evaluation.privileged import PrivilegedPlanner
 
-        assert isinstance(planner, ExpertPlanner)
+        assert isinstance(planner, PrivilegedPlanner)
         planner.attach(session)
     return SimSession(session, started(task, start, luck, _described(robot)))
 

@@ -9,6 +9,7 @@ from configs.schema.eval import PlannerConfig
 from proprio_mllm.planners.file_planner import load_planner
 from proprio_mllm.planners.protocol import Planner
 from proprio_mllm.planners.random_planner import RandomPlanner
+from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 
 __all__ = ["PLANNERS", "make_planner"]
 
@@ -24,12 +25,21 @@ def _random(cfg: PlannerConfig) -> Planner:
     return RandomPlanner(cfg.image_size)
 
 
+def _scripted(cfg: PlannerConfig) -> Planner:
+    return ScriptedPlanner(cfg.image_size)
+
+
 def _file(cfg: PlannerConfig) -> Planner:
     assert cfg.source is not None
     return load_planner(cfg.source)
 
 
-PLANNERS: Final[Mapping[str, Callable[[PlannerConfig], Planner]]] = {"file": _file, "mllm": _mllm, "random": _random}
+PLANNERS: Final[Mapping[str, Callable[[PlannerConfig], Planner]]] = {
+    "file": _file,
+    "mllm": _mllm,
+    "random": _random,
+    "scripted": _scripted,
+}
 
 
 def make_planner(cfg: PlannerConfig) -> Planner:

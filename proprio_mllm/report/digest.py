@@ -12,8 +12,7 @@ from typing import Any, Final
 
 from data.files import file_hash
 from data.records import EpisodeRecord, Outcome
-from proprio_mllm.evaluation.attribution import INVALID_OUTPUT
-from proprio_mllm.report.deciding import Deciding, deciding_failure
+from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, Deciding, deciding_failure, unmet_objects
 from proprio_mllm.report.frames import ActedOut, episode_id
 from proprio_mllm.report.runs import Run
 from proprio_mllm.report.words import code_in_words, goal_in_words, margins_in_words
@@ -31,6 +30,13 @@ _PROVENANCE: Final = (
     "planner", "label", "privileged", "robot", "difficulty", "contingencies", "category", "trials", "limit", "start", "seed",
     "tasks", "weights_digest", "config_hash", "command",
 )  # fmt: skip
+
+
+_ABOUT: Final = {
+    "goal": "it is about a goal that stayed open",
+    "nothing": "nothing got the robot further after it",
+    "other": "no standing failure is about an open goal",
+}
 
 
 def run_digest(run: Run) -> dict[str, Any]:
@@ -140,19 +146,19 @@ def _sentence(found: Deciding, trace: Sequence[Mapping[str, Any]]) -> str:
     step = trace[found.step]
     outcome = step["outcomes"][found.outcome]
     if outcome["code"] == INVALID_OUTPUT:
-        return f"Step {found.step + 1}: the reply was outside the grammar, and no later failure of an action stands."
-    about = "its object is part of a goal that stayed open" if found.about_goal else "no standing failure is about an open goal"
+        return f"Step {found.step + 1}: the reply was outside the grammar, and nothing got the robot further after it."
+    about = _ABOUT[found.about]
     failed = f"{outcome['action']} failed with {outcome['code']} ({outcome['meaning']})"
     return f"Step {found.step + 1}: {failed} and was not made good; {about}."
 
 
-def _unmet_objects(record: EpisodeRecord, goals: Sequence[Mapping[str, Any]], task: Task | None) -> set[str] | None:
-    """Ids named in goals that were open at the end; None where neither ledger nor acting out tells."""
+def _unmet_objects(record: EpisodeRecord, goals: Sequence[Mapping[str, Any]], task: Task | None) -> frozenset[str] | None:
+    """Ids that goals open at the end are about; None where neither ledger nor acting out tells."""
     if task is None:
         return None
     if record.goal_conditions_met == 0.0:  # the ledger has the share of goals, not which ones
-        return {name for goal in task.goals for name in goal.object_ids()}
+        return unmet_objects(task, [False] * len(task.goals))
     held = [goal["held"] for goal in goals]
     if any(one is None for one in held):
         return None
-    return {name for goal, one in zip(task.goals, held, strict=True) if not one[-1] for name in goal.object_ids()}
+    return unmet_objects(task, [one[-1] for one in held])

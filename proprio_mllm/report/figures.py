@@ -1,26 +1,41 @@
-"""Figures of runs: failure types per planner, what the benchmark is made of, how long episodes are. PNG through matplotlib."""
+"""Figures of runs: failure types per planner, what the benchmark is made of, how long episodes are. PNG through matplotlib.
+
+Paper: the figure of failure types (stacked bars per planner, both robots) and the benchmark's three distributions (object
+types, families of single-arm tasks, categories). Every figure says below itself what it was made from.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import textwrap
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from configs.schema.eval import ExperimentConfig
 from data.records import Outcome
 from proprio_mllm.report.runs import Run, newest
 from proprio_mllm.report.summary import Row
-from sim.tasks.task import Task, load_benchmark
+from sim.tasks.task import Task, load_benchmark, tasks_text
 
-__all__ = ["distribution_figures", "failure_figure", "plot_failures", "plot_success"]
+__all__ = ["distribution_figures", "failure_figure", "plot_failures", "plot_success", "task_distribution"]
 
 _COLOURS = {"navigation": "#4477aa", "body_adjustment": "#ee8866", "logical": "#bbbbbb"}
 _GREEN = "#228833"
+_PALE = "#a6c1d9"
+#: Room that a bar's label takes, inches: a line of a list, a bar with its name below.
+_LINE_INCH = 0.19
+_BAR_INCH = 1.05
+#: Longest list that stands in one column.
+_COLUMN = 36
+#: Shares of episodes that are too small to write a number into, percent.
+_TOO_FLAT = 5.0
 
 
 def _figure(width: float, height: float, panels: int = 1) -> tuple[Figure, list[Axes]]:
@@ -28,6 +43,22 @@ def _figure(width: float, height: float, panels: int = 1) -> tuple[Figure, list[
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, panels, squeeze=False)
     return figure, list(axes[0])
+
+
+def _save(figure: Figure, path: Path, source: str) -> Path:
+    """Writes a figure with a line below it that says what it was made from."""
+    width = int(figure.get_figwidth() * 17)
+    figure.supxlabel(textwrap.fill(source, width), fontsize=7, color="#555555", x=0.01, ha="left")
+    figure.savefig(path, dpi=120)
+    return path
+
+
+def _runs_source(runs: Sequence[Run]) -> str:
+    """Which runs a figure shows: their folders, seeds and numbers of scored episodes."""
+    if not runs:
+        return "No run of these planners was found."
+    told = [f"{run.folder.name} (seed {run.metadata['seed']}, {len(run.records)} episodes)" for run in runs]
+    return f"Measured in this simulator; not comparable with the paper's figures. Runs: {'; '.join(told)}."
 
 
 def plot_success(axes: Axes, rows: Sequence[Row], title: str = "") -> None:
@@ -43,74 +74,140 @@ def plot_success(axes: Axes, rows: Sequence[Row], title: str = "") -> None:
 
 
 def plot_failures(axes: Axes, rows: Sequence[tuple[str, Row]], title: str = "") -> None:
-    """Stacked bars: share of episodes that failed, by type."""
-    names = [name for name, _ in rows]
+    """Stacked bars: share of episodes that failed, by type, with the numbers of episodes in them and above."""
+    places = np.arange(len(rows))
     base = np.zeros(len(rows))
     for kind, colour in _COLOURS.items():
-        share = np.array([100 * getattr(row, kind) / max(row.episodes, 1) for _, row in rows])
-        axes.bar(names, share, bottom=base, label=kind.replace("_", " "), color=colour)
+        counts = [int(getattr(row, kind)) for _, row in rows]
+        share = np.array([100 * count / max(row.episodes, 1) for count, (_, row) in zip(counts, rows, strict=True)])
+        bars = axes.bar(places, share, bottom=base, label=kind.replace("_", " "), color=colour, width=0.7)
+        axes.bar_label(
+            bars, [str(n) if s >= _TOO_FLAT else "" for n, s in zip(counts, share, strict=True)], label_type="center"
+        )
         base += share
-    axes.set_ylim(0, 100)
+    for place, top, (_, row) in zip(places, base, rows, strict=True):
+        failed = row.navigation + row.body_adjustment + row.logical
+        axes.text(float(place), float(top) + 1.0, f"{failed}/{row.episodes}", ha="center", va="bottom", fontsize=8)
+    axes.set_xticks(places, [textwrap.fill(name, 13) for name, _ in rows], fontsize=8)
+    axes.set_xlim(-0.6, max(len(rows), 1) - 0.4)
+    axes.set_ylim(0, 108)
+    axes.set_yticks(range(0, 101, 20))
     axes.set_ylabel("failed episodes, %")
     axes.set_title(title)
-    axes.tick_params(axis="x", rotation=20)
-    axes.legend(frameon=False)
+    if rows:
+        axes.legend(frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.14), fontsize=8)
+    else:
+        _say_empty(axes)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _say_empty(axes: Axes) -> None:
+    axes.text(0.5, 0.5, "no runs", ha="center", va="center", transform=axes.transAxes, color="#777777")
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def _shown(cfg: ExperimentConfig, runs: Sequence[Run], robot: str) -> list[Run]:
+    found = [newest(runs, name, robot, cfg.difficulties[0]) for name in cfg.planners]
+    return [run for run in found if run is not None and run.row("all") is not None]
 
 
 def failure_figure(cfg: ExperimentConfig, runs: Sequence[Run], folder: Path) -> list[Path]:
     """Failure types per planner, one panel per robot; planners without a run are left out."""
-    figure, panels = _figure(5.5 * len(cfg.robots), 4.2, len(cfg.robots))
-    for axes, robot in zip(panels, cfg.robots, strict=True):
-        rows: list[tuple[str, Row]] = []
-        for name in cfg.planners:
-            run = newest(runs, name, robot, cfg.difficulties[0])
-            row = None if run is None else run.row("all")
-            if run is not None and row is not None:
-                rows.append((str(run.metadata["label"]), row))
-        plot_failures(axes, rows, f"{robot}, {cfg.difficulties[0]}")
-    path = folder / "failure_figure.png"
-    figure.savefig(path, dpi=120)
-    return [path]
+    shown = {robot: _shown(cfg, runs, robot) for robot in cfg.robots}
+    width = 1.2 + _BAR_INCH * max(4, *(len(group) for group in shown.values()))
+    figure, panels = _figure(width * len(cfg.robots), 4.4, len(cfg.robots))
+    for axes, (robot, group) in zip(panels, shown.items(), strict=True):
+        rows = [(str(run.metadata["label"]), row) for run in group if (row := run.row("all")) is not None]
+        plot_failures(axes, rows, f"{robot.upper()}, {cfg.difficulties[0]}")
+    used = [run for group in shown.values() for run in group]
+    return [_save(figure, folder / "failure_figure.png", f"Numbers: failed episodes. {_runs_source(used)}")]
 
 
-def _bars(axes: Axes, counts: Counter[str], title: str) -> None:
-    names = sorted(counts, key=lambda name: (-counts[name], name))
-    axes.barh(names[::-1], [counts[name] for name in names[::-1]], color=_COLOURS["navigation"])
-    axes.set_title(title)
+def _bars(
+    axes: Axes, names: Sequence[str], counts: Mapping[str, int], title: str, part: Mapping[str, int] | None = None
+) -> None:
+    """Horizontal bars with their numbers, the first one on top; `part` is the darker share of each."""
+    places = np.arange(len(names))[::-1]
+    bars = axes.barh(places, [counts[name] for name in names], color=_COLOURS["navigation"] if part is None else _PALE)
+    if part is not None:
+        axes.barh(places, [part.get(name, 0) for name in names], color=_COLOURS["navigation"])
+    axes.bar_label(bars, [str(counts[name]) for name in names], padding=2, fontsize=7)
+    axes.set_yticks(places, [name.replace("_", " ") for name in names], fontsize=7.5)
+    axes.set_ylim(-0.7, max(len(names), 1) - 0.3)
+    axes.set_xlim(0, 1.15 * max(counts.values(), default=1))
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    axes.tick_params(axis="x", labelsize=7)
+    axes.set_title(title, fontsize=9)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _ranked(counts: Mapping[str, int]) -> list[str]:
+    return sorted(counts, key=lambda name: (-counts[name], name))
+
+
+def _types(names: Iterable[str]) -> set[str]:
+    return {name.rsplit("_", 1)[0] for name in names}
 
 
 def task_distribution(tasks: Sequence[Task], path: Path) -> Path:
-    """Tasks by category, family and room, and the objects that goals name."""
-    figure, axes = _figure(17, 4.6, 4)
-    _bars(axes[0], Counter(task.category for task in tasks), f"{len(tasks)} tasks by category")
-    _bars(axes[1], Counter(task.family for task in tasks), "by family")
-    _bars(axes[2], Counter(task.room for task in tasks), "by room")
-    types = Counter(
-        kind for task in tasks for kind in {name.rsplit("_", 1)[0] for goal in task.goals for name in goal.object_ids()}
-    )
-    _bars(axes[3], Counter(dict(types.most_common(20))), "object types in goals")
-    figure.savefig(path, dpi=110)
-    return path
+    """Tasks by object type, by family of single-arm and of dual-arm tasks, by category, by room."""
+    goals = [_types(name for goal in task.goals for name in goal.object_ids()) for task in tasks]
+    placed = [_types(placement.object_id for placement in task.placements) for task in tasks]
+    scenes = Counter(kind for named, own in zip(goals, placed, strict=True) for kind in named | own)
+    wanted = Counter(kind for named in goals for kind in named)
+    families = Counter(task.family for task in tasks if task.category == "single")
+    small = {
+        "categories": Counter(task.category for task in tasks),
+        "families, dual-arm tasks": Counter(task.family for task in tasks if task.category != "single"),
+        "rooms": Counter(task.room for task in tasks),
+    }
+    types = _ranked(scenes)
+    columns = [types[start : start + _COLUMN] for start in range(0, len(types), _COLUMN)] or [[]]
+    lines = max(*(len(column) for column in columns), len(families), sum(len(counts) + 3 for counts in small.values()))
+    figure, panels = _figure(4.2 * (len(columns) + 2), 1.2 + _LINE_INCH * lines, len(columns) + 2)
+    for number, column in enumerate(columns):
+        title = "object types: tasks with one in a goal (dark), in the scene" if number == 0 else ""
+        _bars(panels[number], column, scenes, title, wanted)
+        panels[number].set_xlim(0, 1.15 * max(scenes.values(), default=1))
+    _bars(panels[-2], _ranked(families), families, f"families, {sum(families.values())} single-arm tasks")
+    for axes, column in zip(panels[:-1], [*columns, list(families)], strict=True):  # lists of any length, lines as high
+        axes.set_ylim(len(column) - 0.3 - lines, len(column) - 0.3)
+    _stacked(panels[-1], small)
+    digest = hashlib.sha256(tasks_text(list(tasks)).encode()).hexdigest()[:12]
+    return _save(figure, path, f"{len(tasks)} tasks of the benchmark, content {digest}; counts of tasks.")
+
+
+def _stacked(axes: Axes, groups: Mapping[str, Counter[str]]) -> None:
+    """Short lists below each other in the place of one panel."""
+    figure, place = axes.figure, axes.get_subplotspec()
+    assert place is not None
+    axes.remove()
+    grid = place.subgridspec(len(groups), 1, height_ratios=[len(counts) + 2 for counts in groups.values()])
+    for number, (title, counts) in enumerate(groups.items()):
+        _bars(figure.add_subplot(grid[number]), _ranked(counts), counts, title)
 
 
 def distribution_figures(cfg: ExperimentConfig, runs: Sequence[Run], folder: Path) -> list[Path]:
     """The benchmark's make-up, and steps per episode of each planner that was run."""
     files = [task_distribution(load_benchmark(), folder / "task_distribution.png")]
-    figure, panels = _figure(5.5 * len(cfg.robots), 4.2, len(cfg.robots))
-    for axes, robot in zip(panels, cfg.robots, strict=True):
-        labels: list[str] = []
-        steps: list[list[int]] = []
-        for name in cfg.planners:
-            run = newest(runs, name, robot, cfg.difficulties[0])
-            won = [] if run is None else [r.steps for r in run.records if r.outcome is Outcome.SUCCESS]
-            if run is not None and won:
-                labels.append(str(run.metadata["label"]))
-                steps.append(won)
-        if steps:
-            axes.boxplot(steps, tick_labels=labels)
+    shown = {robot: _shown(cfg, runs, robot) for robot in cfg.robots}
+    width = 1.2 + _BAR_INCH * max(4, *(len(group) for group in shown.values()))
+    figure, panels = _figure(width * len(cfg.robots), 4.2, len(cfg.robots))
+    for axes, (robot, group) in zip(panels, shown.items(), strict=True):
+        won = [(run, [r.steps for r in run.records if r.outcome is Outcome.SUCCESS]) for run in group]
+        won = [(run, steps) for run, steps in won if steps]
         axes.set_ylabel("steps of successful episodes")
-        axes.set_title(robot)
-        axes.tick_params(axis="x", rotation=20)
-    path = folder / "steps_distribution.png"
-    figure.savefig(path, dpi=120)
-    return [*files, path]
+        axes.set_title(f"{robot.upper()}, {cfg.difficulties[0]}")
+        axes.spines[["top", "right"]].set_visible(False)
+        if won:
+            labels = [f"{textwrap.fill(str(run.metadata['label']), 13)}\nn={len(steps)}" for run, steps in won]
+            axes.boxplot([steps for _, steps in won], tick_labels=labels, medianprops={"color": _COLOURS["body_adjustment"]})
+            axes.tick_params(axis="x", labelsize=8)
+            axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+            axes.set_ylim(bottom=0)
+        else:
+            _say_empty(axes)
+    used = [run for group in shown.values() for run in group]
+    source = f"Box: quartiles; line: median; whiskers: 1.5 quartile ranges. {_runs_source(used)}"
+    return [*files, _save(figure, folder / "steps_distribution.png", source)]

@@ -85,7 +85,7 @@ def test_every_configured_planner_is_made_somewhere() -> None:
 
 def test_registry() -> None:
     assert isinstance(make_planner(PlannerConfig("r", "random", "R", image_size=56)), Planner)
-    with pytest.raises(ValueError, match=r"'expert' is not made here; allowed: file, mllm, random"):
+    with pytest.raises(ValueError, match=r"'expert' is not made here; allowed: file, mllm, random, scripted"):
         make_planner(PlannerConfig("e", "expert", "E"))
 
 

@@ -1,0 +1,276 @@
+"""What comes next: from goals and a belief to an ordered list of arm jobs.
+
+The order is that of a person with two hands: switches and doors that are asked for, work with tools and liquids, small things
+(pick what the hands can take, then put it down), doors to close, what takes both hands, and last what has to stay in a hand.
+Paper: not in it; part of a reference planner of this project.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from data.records import ACTIONS, Action, ActionKind, Arm
+from proprio_mllm.planners.scripted.belief import Belief
+from proprio_mllm.planners.scripted.words import Mention, type_of
+
+__all__ = ["Job", "Want", "holds", "next_jobs"]
+
+#: Types that take both hands, as far as one can know.
+_BIG: Final = ("houseplant", "box", "laundryhamper", "pot", "microwave", "television")
+#: Types that are shut when nobody says otherwise.
+_SHUT: Final = ("cabinet", "drawer", "fridge", "microwave")
+_CHANGES: Final = {"open": "Open", "closed": "Close", "toggled_on": "ToggleOn", "toggled_off": "ToggleOff"}
+_TOOL_VERBS: Final = {"sliced": "Slice", "clean": "Clean"}
+
+
+@dataclass(frozen=True, slots=True)
+class Want:
+    """A goal whose words have been matched with ids.
+
+    Attributes:
+        kind: as `Goal.kind`.
+        thing, place, tool: ids, None for what has not been seen.
+        spoken_thing, spoken_tool: what the instruction says of thing and tool.
+        source: where the thing is said to be.
+    """
+
+    kind: str
+    thing: str | None
+    place: str | None = None
+    tool: str | None = None
+    spoken_thing: Mention | None = None
+    spoken_tool: Mention | None = None
+    source: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One arm action still to be done.
+
+    Attributes:
+        verb: name of an arm or two-arm action.
+        target: its object, None when that has to be found first; empty for actions without one.
+        arm: the arm that has to do it, None when any free one may, or both do.
+        spoken: what to look for when the target is None.
+        place: where the target is said to be.
+    """
+
+    verb: str
+    target: str | None
+    arm: Arm | None = None
+    spoken: Mention | None = None
+    place: str | None = None
+
+    def action(self, arm: Arm | None) -> Action:
+        """The grammar's action, done by `arm`."""
+        one = arm if ACTIONS[self.verb].kind is ActionKind.ARM else None
+        return Action(self.verb, arm=one, object_id=self.target or None)
+
+
+def holds(want: Want, belief: Belief) -> bool:
+    """Whether a want is fulfilled, as far as one can know."""
+    thing = want.thing
+    if thing is None:
+        return False
+    if want.kind == "held":
+        return belief.arm_with(thing) is not None and thing not in belief.held_in_place
+    if want.kind == "lifted":
+        return belief.lifted == thing
+    if want.kind == "on":
+        return want.place is not None and belief.at.get(thing) == want.place
+    if want.kind in ("open", "closed"):
+        return belief.doors.get(thing) is (want.kind == "open")
+    if want.kind in ("toggled_on", "toggled_off"):
+        return belief.switches.get(thing) is (want.kind == "toggled_on")
+    return (want.kind, thing) in belief.done
+
+
+def next_jobs(wants: Sequence[Want], belief: Belief, known: Sequence[str]) -> list[Job]:
+    """Jobs that can be done now; the first one has priority, the others may run beside it on the other arm.
+
+    Returns:
+        An empty list when every want is fulfilled, or nothing can be done for the rest.
+    """
+    pending = [want for want in wants if not holds(want, belief)]
+    if not pending:
+        return []
+    if belief.lifted is not None:
+        return [_set_down(pending, belief)]
+    through = _through_held_door(pending, belief)
+    if through:
+        return through
+    work = [job for want in pending for job in _work(want, belief, known)][:1]
+    if work:
+        return _with_free_hand(work, wants, belief)
+    moves = [want for want in pending if want.kind == "on"]
+    light = [want for want in moves if not _is_heavy(want.thing, want.spoken_thing, belief)]
+    held = [want for want in pending if want.kind in ("held", "lifted")]
+    jobs = [_change(want) for want in pending if want.kind in ("toggled_on", "toggled_off")]
+    opening = [_change(want) for want in pending if want.kind == "open"]  # open doors are in the way: rather late
+    if len(held) != 1 or held[0].kind == "lifted" or len(belief.free_arms()) < 2:
+        jobs += opening
+    jobs += _carry(light, belief)
+    if not light:
+        jobs += [_change(want) for want in pending if want.kind == "closed"]
+    jobs = jobs or _heavy([want for want in moves if want not in light], belief)
+    if not jobs or (len(jobs) == 1 and jobs[0].verb in ("ToggleOn", "ToggleOff", "Open", "Pick")):
+        jobs = jobs + [job for want in held for job in _hold(want, belief)]
+    jobs += [job for job in opening if job not in jobs]
+    return _with_free_hand(list(dict.fromkeys(jobs)), wants, belief)
+
+
+def _change(want: Want) -> Job:
+    """Bringing about a state of a door or switch."""
+    return Job(_CHANGES[want.kind], want.thing, None, want.spoken_thing, want.source)
+
+
+def _is_heavy(thing: str | None, spoken: Mention | None, belief: Belief) -> bool:
+    if thing in belief.heavy or thing in belief.light:
+        return thing in belief.heavy
+    name = type_of(thing) if thing is not None else "" if spoken is None else spoken.name
+    return name in _BIG
+
+
+def _is_shut(place: str | None, belief: Belief) -> bool:
+    return place is not None and not belief.doors.get(place, type_of(place) not in _SHUT)
+
+
+def _pick(thing: str | None, spoken: Mention | None, source: str | None, belief: Belief) -> Job:
+    """Taking a thing, or the opening of what it is in."""
+    place = belief.at.get(thing or "", source)
+    if place is not None and _is_shut(place, belief) and ("Open", place) not in belief.never:
+        return Job("Open", place)
+    return Job("Pick", thing, None, spoken, place)
+
+
+def _set_down(pending: Sequence[Want], belief: Belief) -> Job:
+    lifted = belief.lifted
+    for want in pending:
+        if want.kind == "on" and want.thing == lifted and want.place is not None:
+            return Job("PlaceBoth", want.place)
+    return Job("PlaceBoth", belief.here if belief.here != lifted else None)
+
+
+def _through_held_door(pending: Sequence[Want], belief: Belief) -> list[Job]:
+    """What is left to do through a door that a hand holds open; letting go of it when nothing is."""
+    arm = belief.holds_furniture()
+    if arm is None:
+        return []
+    door = belief.hands[arm]
+    other = belief.hands[arm.other]
+    for want in pending:
+        if want.kind == "on" and want.place == door and want.thing == other and other is not None:
+            return [Job("Place", door, arm.other)]
+        if want.kind in ("held", "on") and want.source == door and want.place != door and other is None:
+            return [Job("Pick", want.thing, arm.other, want.spoken_thing, door)]
+    return [Job("Release", "", arm)]
+
+
+def _work(want: Want, belief: Belief, known: Sequence[str]) -> list[Job]:
+    """The next step towards a state that takes a tool, a vessel or heat."""
+    if want.kind in _TOOL_VERBS:
+        arm = belief.arm_with(want.tool)
+        if arm is None:
+            return [_pick(want.tool, want.spoken_tool, None, belief)]
+        if want.thing in belief.unsteady and want.thing not in belief.held_in_place:
+            return [Job("Hold", want.thing, arm.other, want.spoken_thing)]
+        return [Job(_TOOL_VERBS[want.kind], want.thing, arm, want.spoken_thing, want.source)]
+    if want.kind == "used_up":
+        return [Job("UseUp", want.thing, None, want.spoken_thing, want.source)]
+    if want.kind == "filled":
+        return _fill(want, belief, known)
+    if want.kind == "cooked" and want.place is not None and belief.at.get(want.thing or "") == want.place:
+        if belief.doors.get(want.place) is not False and type_of(want.place) in _SHUT:
+            return [Job("Close", want.place)]
+        return [Job("ResetArm", "", Arm.RIGHT) if belief.switches.get(want.place) else Job("ToggleOn", want.place)]
+    return []
+
+
+def _fill(want: Want, belief: Belief, known: Sequence[str]) -> list[Job]:
+    if want.spoken_tool is not None:
+        arm = belief.arm_with(want.tool)
+        if arm is None:
+            return [_pick(want.tool, want.spoken_tool, None, belief)]
+        return [Job("Pour", want.thing, arm, want.spoken_thing, want.source)]
+    bearer = belief.arm_with(want.thing)
+    if bearer is None:
+        return [_pick(want.thing, want.spoken_thing, want.source, belief)]
+    taps = [name for name in known if type_of(name) in ("faucet", "coffeemachine")]
+    source = want.place or next(iter(taps), None)
+    if source is None:
+        return []
+    if type_of(source) in ("sinkbasin", "bathtubbasin"):
+        taps = [name for name in taps if type_of(name) == "faucet" and ("ToggleOn", name) not in belief.never]
+    else:
+        taps = [source]
+    running = [tap for tap in taps if belief.switches.get(tap)]
+    if not running and taps:
+        return [Job("ToggleOn", taps[min(len(belief.failures("Fill", source)), len(taps) - 1)])]
+    return [Job("Fill", source, bearer)]
+
+
+def _carry(light: Sequence[Want], belief: Belief) -> list[Job]:
+    """Carrying small things: the hands are filled first, but one stays free for a door that is still shut."""
+    in_hand = [want for want in light if belief.arm_with(want.thing) is not None]
+    waiting = [want for want in light if want not in in_hand]
+    if in_hand:  # what may be anywhere is not searched with full hands
+        waiting = [want for want in waiting if want.thing is not None or want.source is not None]
+    free = belief.free_arms()
+    door_ahead = any(_is_shut(want.place, belief) for want in in_hand)
+    if waiting and free and not door_ahead:
+        shut = [want.place for want in waiting if _is_shut(want.place, belief)]
+        ajar = [door for door in shut if door is not None and door not in belief.self_closing]
+        if ajar and not in_hand and len(waiting) > 1:
+            return [Job("Open", ajar[0])]
+        room = 1 if shut else len(free)
+        return list(dict.fromkeys(_pick(w.thing, w.spoken_thing, w.source, belief) for w in waiting))[:room]
+    jobs = []
+    for want in in_hand:
+        if _is_shut(want.place, belief) and free:
+            jobs.append(Job("Open", want.place))
+        else:
+            jobs.append(Job("Place", want.place, belief.arm_with(want.thing)))
+    return jobs
+
+
+def _heavy(moves: Sequence[Want], belief: Belief) -> list[Job]:
+    for want in moves:
+        if _is_shut(want.place, belief):
+            return [Job("Open", want.place)]
+        return [Job("Lift", want.thing, None, want.spoken_thing, want.source)]
+    return []
+
+
+def _hold(want: Want, belief: Belief) -> list[Job]:
+    if want.kind == "lifted" or _is_heavy(want.thing, want.spoken_thing, belief):
+        if want.thing in belief.light:
+            return [_pick(want.thing, want.spoken_thing, want.source, belief)]
+        return [Job("Lift", want.thing, None, want.spoken_thing, want.source)]
+    return [_pick(want.thing, want.spoken_thing, want.source, belief)]
+
+
+def _with_free_hand(jobs: list[Job], wants: Sequence[Want], belief: Belief) -> list[Job]:
+    """The jobs, or first the freeing of a hand that they need."""
+    if not jobs:
+        return jobs
+    head = jobs[0]
+    both = head.verb == "Lift"
+    needed = head.arm if head.arm is not None and head.verb in ("Hold", "Pick") else None
+    if head.arm is not None and needed is None:
+        return jobs
+    free = belief.free_arms()
+    if (len(free) == 2) if both else (needed in free if needed is not None else bool(free)):
+        return jobs
+    tools = {want.tool for want in wants if want.tool is not None and not holds(want, belief)}
+    kept = {want.thing for want in wants if want.kind == "held"} | tools | {head.target}
+    arms = [arm for arm, item in belief.hands.items() if item is not None and (needed is None or arm is needed)]
+    arms.sort(key=lambda arm: belief.hands[arm] in kept)
+    for arm in arms:
+        item = belief.hands[arm]
+        if item in belief.held_in_place or item in belief.self_closing:
+            return [Job("Release", "", arm)]
+        spot = next((want.place for want in wants if want.kind == "on" and want.thing == item), None)
+        return [Job("Place", spot or belief.here, arm)]
+    return jobs

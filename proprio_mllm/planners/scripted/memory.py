@@ -1,0 +1,132 @@
+"""What has been seen when, which id a phrase means, and where to look for what has not been seen.
+
+Paper: not in it; part of a reference planner of this project.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from data.records import Action, Observation
+from proprio_mllm.planners.scripted.belief import Belief
+from proprio_mllm.planners.scripted.words import Mention, candidates, type_of
+
+__all__ = ["Memory"]
+
+#: Where things usually are, in groups of decreasing likelihood.
+_SURFACES: Final = ("countertop", "diningtable", "coffeetable", "sidetable", "desk", "shelf", "dresser", "tvstand")
+_SEATS: Final = ("sofa", "bed", "chair", "stoveburner", "sinkbasin", "bathtubbasin", "toilet", "garbagecan")
+_CONTAINERS: Final = ("cabinet", "drawer", "fridge", "microwave", "laundryhamper", "box")
+#: How to look around at a place: names and amounts.
+_LOOKS: Final = (("RotateLeft", 45.0), ("RotateRight", 90.0), ("MoveBack", 0.3), ("RotateLeft", 45.0), ("MoveUp", 0.2))
+
+#: How often a walk that was blocked is taken again.
+_PATIENCE: Final = 4
+
+
+class Memory:
+    """What an episode has shown.
+
+    Args:
+        rng: decides the order of equally likely places.
+
+    Attributes:
+        belief: the newest belief.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.belief = Belief()
+        self._rng = rng
+        self._known: tuple[str, ...] = ()
+        self._visible: tuple[str, ...] = ()
+        self._found_at: dict[str, str | None] = {}
+        self._meant: dict[tuple[Mention, int], str] = {}
+        self._tried: Action | None = None
+        self._blocked_before = self._blocked_then = 0
+        self._ways: dict[Mention, list[Action]] = {}
+
+    def look(self, observation: Observation) -> None:
+        """Takes in what is known and in view, and where the robot was when it first was."""
+        self._known, self._visible = observation.known_objects, observation.visible_objects
+        here = None
+        for item in reversed(observation.history):
+            if item.step.startswith("GoTo(") and item.feedback.endswith(" ok"):
+                here = item.step[len("GoTo(") :].split(",")[0].rstrip(")")
+                break
+        for name in self._known:
+            self._found_at.setdefault(name, here)
+
+    def find(self, mention: Mention, index: int = 0) -> str | None:
+        """The id that a phrase means, None when nothing that fits has been seen; once chosen it stays."""
+        key = (mention, index)
+        if self._meant.get(key) in self.belief.broken:
+            del self._meant[key]
+        if key not in self._meant:
+            taken = {name for (other, _), name in self._meant.items() if other == mention}
+            fitting = [name for name in candidates(mention, self._known) if name not in taken | self.belief.broken]
+            if mention.place is not None and fitting:
+                fitting = self._at_place(fitting, mention)
+            fitting.sort(key=lambda name: name not in self._visible)
+            if not fitting:
+                return None
+            self._meant[key] = fitting[0]
+        return self._meant[key]
+
+    def _at_place(self, fitting: list[str], mention: Mention) -> list[str]:
+        """Of several things of a name those that came into view, or are in view, at the place where one is said to be."""
+        assert mention.place is not None
+        place = self.find(mention.place)
+        if place is None or place not in self.belief.visited:
+            return fitting if place is None else []
+        found = [name for name in fitting if self._found_at.get(name) == place]
+        return found or [name for name in fitting if name in self._visible]
+
+    def is_near(self, target: str, place: str | None) -> bool:
+        """Whether the robot went to a thing, or to what it stands on, last."""
+        here = self.belief.here
+        if here is None:
+            return False
+        where = self.belief.at.get(target, place if place is not None else self._found_at.get(target))
+        return here == target or (here == where and here in self.belief.visited and target in self._visible)
+
+    def search(self, mention: Mention | None) -> Action:
+        """The next step of looking for something: to the place that was named, then from furniture to furniture."""
+        if mention is None:
+            return Action("Done")
+        if mention not in self._ways:
+            self._ways[mention] = self._round(mention)
+        ways = self._ways[mention]
+        if self._tried is not None:
+            blocked = len(self._blocked(self._tried))
+            patience = _PATIENCE if self._tried.name == "GoTo" else 1
+            if self._blocked_then < blocked <= self._blocked_before + patience:
+                self._blocked_then = blocked
+                return self._tried
+        while ways:
+            action = self._tried = ways.pop(0)
+            if action.name != "Open" or (action.object_id and self.belief.doors.get(action.object_id) is not True):
+                self._blocked_before = self._blocked_then = len(self._blocked(action))
+                return action
+        return Action("Done")
+
+    def _blocked(self, action: Action) -> list[str]:
+        events = self.belief.failures(action.name, action.object_id)
+        return [event.code for event in events if event.code == "BlockedPath"]
+
+    def _round(self, mention: Mention) -> list[Action]:
+        named = None if mention.place is None else self.find(mention.place)
+        order: list[str] = [] if named is None else [named]
+        for group in (_SURFACES, _SEATS, _CONTAINERS):
+            names = sorted(name for name in self._known if type_of(name) in group and name != named)
+            order += [names[int(index)] for index in self._rng.permutation(len(names))]
+        steps = [] if named is not None else [Action("MoveUp", amount=0.2), *[Action("RotateLeft", amount=90.0)] * 3]
+        for name in order:
+            steps.append(Action("GoTo", object_id=name))
+            free = self.belief.free_arms()
+            if type_of(name) in _CONTAINERS and free:
+                steps.append(Action("Open", arm=free[0], object_id=name))
+            looks = _LOOKS if name == named else _LOOKS[:2]
+            steps += [Action(verb, amount=amount) for verb, amount in looks]
+        return steps

@@ -1,0 +1,217 @@
+"""A reference planner of rules: it reads the instruction's words and the feedback's codes, and learns nothing.
+
+It sees what every planner sees and uses of that the words, the names and the history; neither picture nor joints. What comes
+next is in `jobs`; here is how it is done: find what has not been seen, walk to it, try, and answer each failure code with the
+change that its meaning suggests. When a stance does not serve, the next one is tried; what fails too often is given up.
+
+Paper: not in its tables; added as a reference between random actions and learned planners.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from data.records import ACTIONS, Action, ActionKind, Arm, Feedback, Observation, PlanStep
+from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
+from proprio_mllm.planners.scripted.belief import Belief
+from proprio_mllm.planners.scripted.instruction import TOOLS, Goal, read_goals
+from proprio_mllm.planners.scripted.jobs import Job, Want, next_jobs
+from proprio_mllm.planners.scripted.memory import Memory
+from proprio_mllm.planners.scripted.words import Mention
+
+__all__ = ["ScriptedPlanner"]
+
+#: Distances (m) and bearings (deg) of the stances that are tried in turn.
+_STANCES: Final[tuple[tuple[float | None, float | None], ...]] = (
+    (None, None), (None, -20.0), (None, 20.0), (0.5, None), (0.4, None), (0.6, None), (0.5, -30.0), (0.5, 30.0),
+)  # fmt: skip
+#: Changes of pelvis height (m) that are tried in turn at one stance; a change back is half of that.
+_RISES_M: Final = (0.1, 0.15, 0.15)
+#: Ways out when a walk is blocked, in turn.
+_ASIDE: Final = (("MoveBack", 0.3), ("MoveBack", 0.15), ("MoveRight", 0.25), ("MoveLeft", 0.25))
+_ASIDE_NAMES: Final = ("MoveBack", "MoveRight", "MoveLeft")
+#: Failures of one action after which it is given up.
+_PATIENCE: Final = 16
+#: Codes after which the same thing may work when it is tried again.
+_BAD_LUCK: Final = ("NothingHappened", "Locked", "Slipped", "Spilled")
+#: Codes that a better knowledge of the world answers: what comes next is another job.
+_KNOWLEDGE: Final = (
+    "AlreadyInState", "NotDirty", "HandOccupied", "HandEmpty", "NeedsTwoHands", "NotLiftable", "ReceptacleClosed",
+    "NeedsSteadying", "SourceOff", "AlreadyHeld", "InUse",
+)  # fmt: skip
+_WITH_OBJECT: Final = ("Pick", "ToggleOn", "ToggleOff", "Open", "Place")
+
+
+class ScriptedPlanner:
+    """Rules over words and feedback codes.
+
+    Args:
+        image_size: side of the head view it is shown and ignores, pixels.
+    """
+
+    privileged = False
+
+    def __init__(self, image_size: int = 112) -> None:
+        self.image_size = image_size
+        self._memory = Memory(np.random.default_rng(0))
+        self._goals: tuple[Goal, ...] | None = None
+
+    def reset(self, task: TaskInfo, rng: np.random.Generator) -> None:
+        """Forgets the last episode; `rng` decides the order in which unnamed furniture is searched."""
+        self._memory = Memory(rng)
+        self._goals = None
+
+    def step(self, observation: Observation, feedback: Feedback | None) -> PlannerReply:
+        """The next step of the rules; what happened before is in the observation's history."""
+        started = time.perf_counter()
+        step = self._plan(observation)
+        return PlannerReply(step.to_text(), step, latency_s=time.perf_counter() - started)
+
+    def _plan(self, observation: Observation) -> PlanStep:
+        memory = self._memory
+        if self._goals is None:
+            self._goals = read_goals(observation.instruction, observation.known_objects)
+        memory.look(observation)
+        doors = [memory.find(goal.thing) for goal in self._goals if goal.ajar]
+        belief = memory.belief = Belief.of(observation.history, [door for door in doors if door is not None])
+        jobs = next_jobs(self._wants(belief), belief, observation.known_objects)
+        jobs = [job for job in jobs if not self._given_up(job, belief)]
+        if not jobs:
+            return PlanStep((Action("Done"),))
+        head = jobs[0]
+        freed = self._get_free(belief)
+        if freed is not None:
+            return PlanStep((freed,))
+        if head.target is None:
+            return PlanStep((memory.search(head.spoken),))
+        if head.target == "":
+            return PlanStep((head.action(head.arm),))
+        moved = self._approach(head, belief)
+        if moved is not None:
+            return PlanStep((moved,))
+        return self._act(head, jobs[1:], belief, observation)
+
+    # ---- goals
+
+    def _wants(self, belief: Belief) -> list[Want]:
+        """The goals with ids; of several any, as many as are meant."""
+        wants: list[Want] = []
+        assert self._goals is not None
+        on = {goal.thing for goal in self._goals if goal.kind == "on"}
+        for goal in self._goals:
+            if goal.kind == "filled" and goal.thing in on and goal.tool is None and goal.place is None:
+                continue  # it is full, and only has to stay so
+            tool = goal.tool or (Mention(TOOLS[goal.kind][0]) if goal.kind in TOOLS else None)
+            place = None if goal.place is None else self._memory.find(goal.place)
+            for index in range(goal.thing.count):
+                thing = self._memory.find(goal.thing, index)
+                source = None if goal.thing.place is None else self._memory.find(goal.thing.place)
+                tool_id = None if tool is None else self._memory.find(tool)
+                wants.append(Want(goal.kind, thing, place, tool_id, goal.thing, tool, source))
+                if goal.place is not None and place is None:
+                    wants[-1] = Want("held", None, None, None, goal.place, None, None)  # the place has to be found first
+        broken = [want for want in wants if want.thing in belief.broken]
+        return [want for want in wants if want not in broken]
+
+    def _given_up(self, job: Job, belief: Belief) -> bool:
+        return (job.verb, job.target or "") in belief.never or len(belief.failures(job.verb, job.target)) >= _PATIENCE
+
+    # ---- the body
+
+    def _get_free(self, belief: Belief) -> Action | None:
+        """A step aside when a way is blocked, a rise of what both hands carry; None when nothing is in the way."""
+        if belief.lifted is not None and belief.lowered_m > 0.02 and not belief.at_limit and self._just("Lift", belief):
+            return Action("MoveUp", amount=round(min(1.0, belief.lowered_m), 2))
+        if not belief.last or belief.last[0].code != "BlockedPath":
+            return None
+        walking = belief.last[0].action.name == "GoTo"
+        if belief.lifted is not None and belief.blocked == 1:
+            return Action("MoveUp", amount=_RISES_M[1])
+        if walking and belief.blocked == 1:
+            return None  # another stance may do
+        name, amount = _ASIDE[(belief.blocked - 1) % len(_ASIDE)]
+        return Action(name, amount=amount)
+
+    @staticmethod
+    def _just(verb: str, belief: Belief) -> bool:
+        return any(event.ok and event.action.name == verb for event in belief.last)
+
+    def _approach(self, job: Job, belief: Belief) -> Action | None:
+        """The body action that has to come before a job; None when it can be tried from here."""
+        target = job.target
+        assert target is not None
+        failed = belief.failures(job.verb, target)
+        last = next((event for event in belief.last if event.about(job.verb, target) and not event.ok), None)
+        if last is None:
+            return self._walk(job, belief, failed=bool(failed))
+        if last.code in ("BodyTooHigh", "BodyTooLow"):
+            return self._height(job, belief, up=last.code == "BodyTooLow")
+        if last.code in _BAD_LUCK and len(failed) % 3:
+            return None
+        if last.code in _KNOWLEDGE:
+            return self._walk(job, belief, failed=False)
+        if last.code == "Obstructed" and job.verb.startswith("Place") and not belief.heights and True not in belief.at_limit:
+            return Action("MoveUp", amount=_RISES_M[0])  # over the edge
+        if last.code in ("Obstructed", "GraspMissed", "HandleSlipped") and job.arm is None:
+            arms = {event.action.arm for event in failed if event.code == last.code}
+            if len(arms) == 1 and len(belief.free_arms()) == 2:
+                return None  # the other arm may
+        return self._stance(job, belief)
+
+    def _walk(self, job: Job, belief: Belief, failed: bool) -> Action | None:
+        """Goes to a job's target, unless the robot is there or has just gone there as well as it can."""
+        events = belief.last
+        if events and events[0].about("GoTo", job.target) and not events[0].ok:
+            return self._stance(job, belief)
+        if events and events[0].action.name in _ASIDE_NAMES:
+            return Action("GoTo", object_id=job.target)
+        near = belief.here == job.target if job.verb == "Lift" else self._memory.is_near(job.target or "", job.place)
+        return None if failed or near else Action("GoTo", object_id=job.target)
+
+    def _height(self, job: Job, belief: Belief, up: bool) -> Action:
+        """A change of pelvis height; after some at one stance, another stance."""
+        done = belief.heights
+        if len(done) >= len(_RISES_M) or up in belief.at_limit:
+            return self._stance(job, belief)
+        turned = any((rise > 0) != up for rise in done)
+        amount = 0.05 if turned else _RISES_M[len(done)]
+        return Action("MoveUp" if up else "MoveDown", amount=amount)
+
+    def _stance(self, job: Job, belief: Belief) -> Action:
+        target = job.target
+        assert target is not None
+        distance, bearing = _STANCES[belief.stances.get(target, 0) % len(_STANCES)]
+        return Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
+
+    # ---- the arms
+
+    def _act(self, head: Job, others: Sequence[Job], belief: Belief, observation: Observation) -> PlanStep:
+        """The head job, with one for the other arm beside it where both may be done from here."""
+        if ACTIONS[head.verb].kind is not ActionKind.ARM:
+            return PlanStep((head.action(None),))
+        arm = head.arm or self._arm(head, belief)
+        first = head.action(arm)
+        for job in others:
+            if job.target in (None, "") or job.verb not in _WITH_OBJECT or head.verb not in _WITH_OBJECT:
+                continue
+            if job.arm is arm or (job.arm is None and arm.other not in belief.free_arms()):
+                continue
+            if job.target == head.target and not head.verb == job.verb == "Place":
+                continue
+            seen = job.target in observation.visible_objects or self._memory.is_near(job.target or "", job.place)
+            if seen and not belief.failures(job.verb, job.target):
+                return PlanStep((first, job.action(arm.other)))
+        return PlanStep((first,))
+
+    def _arm(self, job: Job, belief: Belief) -> Arm:
+        """The free arm on the side where the target should be; the other one after a failure that an arm can be blamed for."""
+        free = belief.free_arms() or (Arm.RIGHT,)
+        side = Arm.LEFT if belief.bearing_deg > 0 else Arm.RIGHT
+        last = next((event for event in belief.last if event.about(job.verb, job.target)), None)
+        if last is not None and not last.ok and last.action.arm is not None and last.code not in _BAD_LUCK:
+            side = last.action.arm.other
+        return side if side in free else free[0]
