@@ -30,7 +30,7 @@ from sim.skills.runner import CONTROL_DT_S
 from sim.tasks.task import load_benchmark
 from sim.world import World
 
-__all__ = ["VideoConfig", "VideoRecorder", "main"]
+__all__ = ["VideoConfig", "VideoRecorder", "check_film", "main"]
 
 _CAPTION_PX: Final = 28
 _HOLD_S: Final = 0.5
@@ -67,17 +67,26 @@ class VideoConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not self.out.endswith(".mp4"):
-            raise ValueError(f"out must end in .mp4, got {self.out!r}")
-        unknown = [name for name in self.cameras if name not in CAMERAS]
-        if unknown or not self.cameras:
-            raise ValueError(f"cameras {list(self.cameras)} must be some of {', '.join(CAMERAS)}")
-        if self.size % 2 or not 16 <= self.size <= 1280:
-            raise ValueError(f"size must be even and within 16..1280, got {self.size}")
-        if not 1 <= self.fps <= 50:
-            raise ValueError(f"fps {self.fps} outside 1..50")
+        check_film(self.out, self.cameras, self.size, self.fps)
         if not self.plan and self.task is None:
             raise ValueError("give a plan, or a task that the expert solves")
+
+
+def check_film(out: str, cameras: Sequence[str], size: int, fps: int) -> None:
+    """Refuses films that cannot be made.
+
+    Raises:
+        ValueError: naming the value and what is allowed.
+    """
+    if not out.endswith(".mp4"):
+        raise ValueError(f"out must end in .mp4, got {out!r}")
+    unknown = [name for name in cameras if name not in CAMERAS]
+    if unknown or not cameras:
+        raise ValueError(f"cameras {list(cameras)} must be some of {', '.join(CAMERAS)}")
+    if size % 2 or not 16 <= size <= 1280:
+        raise ValueError(f"size must be even and within 16..1280, got {size}")
+    if not 1 <= fps <= 50:
+        raise ValueError(f"fps {fps} outside 1..50")
 
 
 class VideoRecorder:

@@ -17,8 +17,7 @@ from proprio_mllm.evaluation.attribution import INVALID_OUTPUT
 from proprio_mllm.report.arguments import read_named
 from proprio_mllm.report.reenact import Episode, Reenactment, RunTasks, find_record
 from proprio_mllm.report.runs import load_run
-from sim.rendering import CAMERAS
-from sim.video import VideoRecorder
+from sim.video import VideoRecorder, check_film
 
 __all__ = ["VideoConfig", "film", "main"]
 
@@ -48,15 +47,7 @@ class VideoConfig:
     out: str | None = None
 
     def __post_init__(self) -> None:
-        if self.out is not None and not self.out.endswith(".mp4"):
-            raise ValueError(f"out must end in .mp4, got {self.out!r}")
-        unknown = [name for name in self.cameras if name not in CAMERAS]
-        if unknown or not self.cameras:
-            raise ValueError(f"cameras {list(self.cameras)} must be some of {', '.join(CAMERAS)}")
-        if self.size % 2 or not 16 <= self.size <= 1280:
-            raise ValueError(f"size must be even and within 16..1280, got {self.size}")
-        if not 1 <= self.fps <= 50:
-            raise ValueError(f"fps {self.fps} outside 1..50")
+        check_film("default.mp4" if self.out is None else self.out, self.cameras, self.size, self.fps)
 
 
 def film(episode: Episode, out: Path, config: VideoConfig) -> int:

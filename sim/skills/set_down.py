@@ -27,7 +27,7 @@ from sim.skills.reach import blame
 from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
-from sim.skills.two_arm import BOTH_TOLERANCE_M, MOST_SAG_M, SAG_M, hands_m, shifted
+from sim.skills.two_arm import BOTH_TOLERANCE_M, against_sag, hands_m
 
 __all__ = ["BothPlacement", "assess_place_both", "place_both"]
 
@@ -239,10 +239,9 @@ def place_both(body: Body, action: Action, luck: Luck) -> Skill:
         first = [placement.raised]
         yield from body.move_both(first, speed=0.6)
         yield from wait(0.1)
-        if _under_m(body, thing, placement) > -_EDGE_M:  # the servos give way under the load
-            sag_m = max(body.hand_height(placement.raised) - hands_m(body), 0.0)
-            higher = shifted(body, 2.0 * min(sag_m, MOST_SAG_M), 0.0)
-            if sag_m > SAG_M and higher.error_m <= BOTH_TOLERANCE_M:
+        if _under_m(body, thing, placement) > -_EDGE_M:
+            higher = against_sag(body, body.hand_height(placement.raised) - hands_m(body))
+            if higher is not None:
                 first = [higher]
                 yield from body.move_both(first, speed=0.5)
         under_m = _under_m(body, thing, placement)

@@ -26,7 +26,7 @@ from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
 
-__all__ = ["BOTH_TOLERANCE_M", "MOST_SAG_M", "SAG_M", "assess_lift", "hands_m", "lift", "shifted"]
+__all__ = ["BOTH_TOLERANCE_M", "against_sag", "assess_lift", "hands_m", "lift"]
 
 Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
@@ -39,8 +39,8 @@ _FIRST_M: Final = 0.05
 _HOLDS: Final = ((0.3, 0.2), (0.3, 0.12), (0.3, 0.05), (0.25, 0.2), (0.25, 0.1), (0.2, 0.06), (0.2, 0.0),
                  (0.15, 0.05), (0.15, 0.0), (0.12, 0.0), (0.08, 0.0))  # fmt: skip
 #: Sagging of what is held that is made up for.
-SAG_M: Final = 0.015
-MOST_SAG_M: Final = 0.06
+_SAG_M: Final = 0.015
+_MOST_SAG_M: Final = 0.06
 #: Radians of tilt that a metre of height is worth when one of them is chosen.
 _HEIGHT_WEIGHT: Final = 2.4
 
@@ -152,7 +152,7 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
     outcome = luck(action)
     for arm in Arm:
         body.world.attach(arm.value, thing.object_id)
-    first = shifted(body, _FIRST_M, 0.0)
+    first = _shifted(body, _FIRST_M, 0.0)
     yield from body.move_both([first], speed=0.5)
     if outcome != "success":
         for arm in Arm:
@@ -163,18 +163,16 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
         yield from body.stow_both()
         code = FailureCode.SPILLED if outcome == "spilled" else FailureCode.SLIPPED
         raise SkillFailure(code, contingency=outcome)
-    options = [(up, shifted(body, up, back)) for up, back in _HOLDS]
+    options = [(up, _shifted(body, up, back)) for up, back in _HOLDS]
     options = [(up, goal) for up, goal in options if goal.error_m <= BOTH_TOLERANCE_M]
     if options:
         before_m = hands_m(body)
         up, hold = min(options, key=lambda option: option[1].tilt_rad - _HEIGHT_WEIGHT * option[0])
         yield from body.move_both([hold], speed=0.5)
         yield from wait(0.1)
-        sag_m = before_m + up - hands_m(body)
-        if sag_m > SAG_M:  # the servos give way under the load
-            higher = shifted(body, 2.0 * min(sag_m, MOST_SAG_M), 0.0)
-            if higher.error_m <= BOTH_TOLERANCE_M:
-                yield from body.move_both([higher], speed=0.5)
+        higher = against_sag(body, before_m + up - hands_m(body))
+        if higher is not None:
+            yield from body.move_both([higher], speed=0.5)
     yield from wait(0.1)
     if body.lifted != thing.object_id or thing.object_id in body.world.all_parents():
         for arm in Arm:
@@ -188,6 +186,14 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
 def hands_m(body: Body) -> float:
     """Mean height of both hands as they are, metres."""
     return float(np.mean([body.hand_pose(arm)[0][2] for arm in Arm]))
+
+
+def against_sag(body: Body, sag_m: float) -> BothGoal | None:
+    """The posture that makes up for how far the servos give way under a load, None where that is little or out of reach."""
+    if sag_m <= _SAG_M:
+        return None
+    higher = _shifted(body, 2.0 * min(sag_m, _MOST_SAG_M), 0.0)
+    return higher if higher.error_m <= BOTH_TOLERANCE_M else None
 
 
 def _press(body: Body, reach: BothReach, thing: ObjectInstance) -> Skill:
@@ -205,7 +211,7 @@ def _press(body: Body, reach: BothReach, thing: ObjectInstance) -> Skill:
         yield
 
 
-def shifted(body: Body, up_m: float, back_m: float) -> BothGoal:
+def _shifted(body: Body, up_m: float, back_m: float) -> BothGoal:
     """Both hands moved by the same displacement, their orientation kept."""
     move = up_m * _UP - back_m * body.turn_to_world(np.array([1.0, 0.0, 0.0]))
     wishes = {}
