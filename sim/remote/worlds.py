@@ -157,13 +157,14 @@ class Worlds:
         _end(world)
 
     def stop(self) -> None:
-        """Ends all worlds."""
+        """Ends all worlds; returns when those that were just found idle have ended too."""
         self._stop.set()
         for name in list(self._worlds):
             try:
                 self.close(name)
             except WorldGoneError:
                 continue
+        self._reaper.join()
 
     def _answer(self, world: _World) -> dict[str, Any]:
         if not world.pipe.poll(self._step_s):
