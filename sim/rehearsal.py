@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from data.records import Action
+from data.records import Action, PlanStep
 from sim.navigation import Stance
 from sim.session import Session
 from sim.skills.locomotion import best_stance
@@ -67,6 +67,48 @@ class Rehearsal:
             body.hurried = False
             world.restore(saved)
         return False
+
+    def works_together(self, pairs: Sequence[tuple[Action, Action]], stance: Stance, height_m: float) -> bool:
+        """Whether two actions would both be tried from a stance at a height, for one of some choices of arms."""
+        world, body = self._session.world, self._session.body
+        saved = world.save()
+        body.hurried = True
+        try:
+            self._put(stance, height_m)
+            return any(all(self._session.assess(action) is None for action in pair) for pair in pairs)
+        finally:
+            body.hurried = False
+            world.restore(saved)
+
+    def leads_to(self, first: Action, then: Action, stance: Stance | None = None, height_m: float | None = None) -> bool:
+        """Whether an action would be tried after another one has been acted out.
+
+        Args:
+            first: acted out in physics; undone afterwards.
+            then: only asked for.
+            stance: where the robot would stand, here when None.
+            height_m: pelvis height, the present one when None.
+        """
+        session = self._session
+        with session.imagining():
+            if stance is not None or height_m is not None:
+                base = session.body.commanded_base() if stance is None else stance
+                self._put(base, session.body.pelvis_height_m if height_m is None else height_m)
+            session.body.hurried = True
+            try:
+                if session.assess(first) is not None:
+                    return False
+                _, feedback = session.step(PlanStep((first,)))  # it also looks: what was shut away is known afterwards
+                return feedback.outcomes[0].success and session.assess(then) is None
+            finally:
+                session.body.hurried = False
+
+    def heights_m(self) -> list[float]:
+        """Pelvis heights worth trying, the present one first, then the nearest."""
+        low, high = self._session.body.spec.pelvis_height_range_m
+        present = self._session.body.pelvis_height_m
+        grid = [present + step * HEIGHT_STEP_M for step in (0, 1, -1, 2, -2, 4, -4, 6, -6, 8, -8)]
+        return [height for height in grid if low - 0.001 <= height <= high + 0.001]
 
     def _heights(self, actions: Sequence[Action], stance: Stance, present_m: float) -> list[float]:
         """The present height and the nearest ones at which the target is within the arms' envelope."""

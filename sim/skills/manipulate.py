@@ -37,6 +37,9 @@ Luck = Callable[[Action], str]
 GRASP_GAP_M: Final = 0.015
 _APPROACH_M: Final = 0.09
 _LIFT_M: Final = 0.06
+#: Length of the straight way down onto a surface, and how far above the rim of a box or drawer it starts.
+_APPROACH_PLACE_M: Final = 0.08
+_OVER_RIM_M: Final = 0.02
 _MAX_PLANS: Final = 60
 #: Share of the usual speed at which liquids are carried.
 _CARE: Final = 0.6
@@ -275,7 +278,18 @@ def plan_place(body: Body, arm: Arm, thing: ObjectInstance, receptacle: ObjectIn
     spots = body.free_spots(thing, receptacle, arm)
     if not spots:
         raise SkillFailure(FailureCode.RECEPTACLE_FULL)
-    return plan_bring(body, arm, thing, spots, (thing.object_id, receptacle.object_id))
+    over_m = max(_APPROACH_PLACE_M, _rim_m(body, receptacle) - float(spots[0][2]) + _OVER_RIM_M)
+    return plan_bring(body, arm, thing, spots, (thing.object_id, receptacle.object_id), from_m=over_m)
+
+
+def _rim_m(body: Body, receptacle: ObjectInstance) -> float:
+    """World height of the rim of a drawer, box or vessel that is filled from above; minus infinity for other receptacles."""
+    data, model = body.world.data, body.world.model
+    parts = body.world.part_of_geom[receptacle.object_id]
+    hollow = {int(model.geom_bodyid[geom]) for geom, part in parts if part.shape in ("tray", "cup")}
+    around = [geom for geom, _ in parts if int(model.geom_bodyid[geom]) in hollow and model.geom_contype[geom] > 0]
+    halves = [float(np.abs(data.geom_xmat[geom].reshape(3, 3)[2]) @ model.geom_aabb[geom, 3:]) for geom in around]
+    return max((float(data.geom_xpos[geom, 2]) + half for geom, half in zip(around, halves, strict=True)), default=-np.inf)
 
 
 def plan_bring(
@@ -287,6 +301,7 @@ def plan_bring(
     point: Array | None = None,
     above_m: float = 0.006,
     coming_from: Array = _UP,
+    from_m: float = _APPROACH_PLACE_M,
 ) -> tuple[Array, Reach, Array]:
     """How the arm brings what it holds, upright, to one of some spots.
 
@@ -299,6 +314,7 @@ def plan_bring(
         point: (3,) point of the object that belongs above the spot, in its own frame; its frame's origin when None.
         above_m: height of the object's lowest point above the spot.
         coming_from: (3,) unit direction from the spot back to where the last straight way starts.
+        from_m: length of that way.
 
     Returns:
         The spot, the motion, and the direction in which the hand leaves.
@@ -328,7 +344,7 @@ def plan_bring(
             for extra in (0.0, 0.35, -0.35, 0.75, -0.75):
                 turn = _turn_z(straight + extra)
                 wish = HandPose(spot + lift - turn @ offset, turn @ pointing, turn @ closing)
-                reach = plan_reach(body, arm, wish, coming_from, 0.08, ignore, pointing=0.9, closing=0.93)
+                reach = plan_reach(body, arm, wish, coming_from, from_m, ignore, pointing=0.9, closing=0.93)
                 if reach is not None:
                     return spot, reach, -(turn @ pointing)
         raise SkillFailure(FailureCode.OBSTRUCTED)
