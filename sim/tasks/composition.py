@@ -25,7 +25,7 @@ class Share:
     Attributes:
         family: a name of `sim.tasks.families.FAMILIES`.
         count: how many tasks.
-        rooms: where, dealt out in turn.
+        rooms: where, dealt out in turn; those after the first `count` stand in for rooms that cannot give their share.
     """
 
     family: str
@@ -37,24 +37,24 @@ COMPOSITION: Final = (
     # 60 single-arm tasks: pick 14, place 14, open and close 12, toggle 12, and one action on food, dishes or supplies 8
     Share("pick", 14, _ALL),
     Share("place", 10, _ALL),
-    Share("place_any", 4, (*_LIVING, "kitchen_2")),
-    Share("open", 6, (*_LIVING, *_BEDROOMS, "bathroom_2")),
-    Share("close", 6, (*_KITCHENS, *_BEDROOMS, "bathroom_1")),
-    Share("toggle_on", 6, (*_KITCHENS, *_LIVING)),
+    Share("place_any", 4, (*_LIVING, "kitchen_2", *_BEDROOMS)),
+    Share("open", 6, (*_LIVING, *_BEDROOMS, "bathroom_2", *_KITCHENS)),
+    Share("close", 6, (*_KITCHENS, *_BEDROOMS, "bathroom_1", *_LIVING)),
+    Share("toggle_on", 6, (*_KITCHENS, *_LIVING, *_BEDROOMS)),
     Share("toggle_off", 6, (*_KITCHENS, "living_room_2", "bedroom_2", "bathroom_1")),
-    Share("fill", 2, ("kitchen_1", "kitchen_2")),
-    Share("slice", 2, ("kitchen_2", "kitchen_3")),
-    Share("clean", 1, ("kitchen_3",)),
-    Share("cook", 1, ("kitchen_1",)),
-    Share("use_up", 2, ("bathroom_1", "bedroom_1")),
+    Share("fill", 2, ("kitchen_2", "kitchen_1", "kitchen_3", *_BATHROOMS)),
+    Share("slice", 2, ("kitchen_2", "kitchen_3", "kitchen_1")),
+    Share("clean", 1, ("kitchen_3", "kitchen_2", "kitchen_1")),
+    Share("cook", 1, ("kitchen_2", "kitchen_3", "kitchen_1")),
+    Share("use_up", 2, ("bathroom_1", "bedroom_1", "kitchen_1")),
     # 166 optional: two objects 60, two actions at once 36, through an opened receptacle 40, three objects 30
     Share("transport_two", 30, _ALL),
     Share("transport_any_two", 10, _DRY),
     Share("transport_each", 20, _ALL),
-    Share("pick_and_toggle_on", 12, _DRY),
-    Share("pick_and_toggle_off", 12, _DRY),
-    Share("pick_and_open", 3, _KITCHENS),
-    Share("toggle_both", 9, _KITCHENS),
+    Share("pick_and_toggle_on", 14, _DRY),
+    Share("pick_and_toggle_off", 14, _DRY),
+    Share("pick_and_open", 5, _KITCHENS),
+    Share("toggle_both", 3, _KITCHENS),
     Share("fetch_two", 14, _DRY),
     Share("stow_two", 14, _DRY),
     Share("stow_two_close", 12, _DRY),

@@ -6,9 +6,10 @@
     python -m sim.tasks.generate --table       # the certificates per family and robot, as Markdown
 
 A slot is a family in a room. Its seeds are tried in order, and those tasks are kept whose certificates say what their category
-promises (`sim.tasks.certificates`), whose instruction is new, and whose subject has not yet been asked for too often. Both
-checks print counts per category, family, room, split and type as JSON. Generating takes hours on two cores; what has been tried
-is kept in `outputs/tasks`, by a hash of the simulator's files, so that it goes on where it was stopped.
+promises (`sim.tasks.certificates`), whose instruction is new, and whose subject has not yet been asked for too often. What a
+room cannot give is taken from the family's other rooms. Both checks print counts per category, family, room, split and type as
+JSON. Generating takes hours on two cores; what has been tried is kept in `outputs/tasks`, by a hash of the simulator's files, so
+that it goes on where it was stopped.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import logging
 import multiprocessing
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,7 +46,7 @@ from sim.tasks.sample import sample_task
 from sim.tasks.task import BENCHMARK_PATH, Task, load_benchmark, tasks_text, write_tasks
 from sim.world import WorldError
 
-__all__ = ["Slot", "counts", "generate", "main", "rebuild", "slots"]
+__all__ = ["Slot", "counts", "generate", "main", "moved", "rebuild", "slots"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -76,16 +77,48 @@ class Slot:
         first = self.number * _SEEDS_PER_SLOT
         return range(first, first + min(_SEEDS_PER_SLOT, _TRIES * self.count))
 
+    @property
+    def more_seeds(self) -> bool:
+        """Whether one more task would let it try more seeds."""
+        return _TRIES * self.count < _SEEDS_PER_SLOT
+
 
 def slots(composition: Sequence[Share] = COMPOSITION) -> tuple[Slot, ...]:
-    """Every family's tasks, dealt out to its rooms in turn."""
+    """Every family's tasks, dealt out to its rooms in turn; a room that gets none stands in for the others."""
     found: list[Slot] = []
     for share in composition:
         for index, room in enumerate(share.rooms):
             count = share.count // len(share.rooms) + (index < share.count % len(share.rooms))
-            if count:
-                found.append(Slot(len(found), share.family, room, count))
+            found.append(Slot(len(found), share.family, room, count))
     return tuple(found)
+
+
+def moved(wanted: Sequence[Slot], found: Mapping[int, int], totals: Mapping[str, int]) -> list[Slot]:
+    """The slots that have to find more, because others of their family found fewer than they were to.
+
+    Args:
+        wanted: all slots, with the counts they were to find.
+        found: how many each one found, by its number.
+        totals: tasks that each family is to have.
+
+    Raises:
+        RuntimeError: when only families are short whose rooms are all exhausted; the message names them.
+    """
+    more: list[Slot] = []
+    short: list[str] = []
+    for family, total in totals.items():
+        rooms = [slot for slot in wanted if slot.family == family]
+        missing = total - sum(found[slot.number] for slot in rooms)
+        able = [slot for slot in rooms if found[slot.number] == slot.count and slot.more_seeds]
+        if missing and not able:
+            short.append(f"{family}: {missing} of {total}")
+            continue
+        for index, slot in enumerate(able):
+            extra = missing // len(able) + (index < missing % len(able))
+            more += [replace(slot, count=slot.count + extra)] if extra else []
+    if short and not more:
+        raise RuntimeError("no room gives the missing tasks of " + "; ".join(short))
+    return more
 
 
 def _attempt(slot: Slot, seed: int) -> tuple[Task, tuple[Certificate, ...]]:
@@ -167,20 +200,25 @@ def generate(folder: Path, workers: int = 2) -> tuple[list[Task], list[Certifica
         workers: processes.
 
     Raises:
-        RuntimeError: when slots cannot be filled; the message names them and how many tasks each is short of.
+        RuntimeError: when a family's rooms do not give as many tasks as they should.
     """
-    wanted = slots()
     folder.mkdir(parents=True, exist_ok=True)
+    filled: dict[int, list[tuple[Task, tuple[Certificate, ...]]]] = {}
+    wanted = {slot.number: slot for slot in slots()}
+    totals = {share.family: share.count for share in COMPOSITION}
+    search = list(wanted.values())
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, start_worker) as pool:
-        results = pool.map(_fill_star, [(slot, folder) for slot in wanted])
-        filled = list(tqdm(results, total=len(wanted), desc="slots", unit="slot"))
-    short = [f"{slot.family} in {slot.room}: {len(found)}/{slot.count}" for slot, found in zip(wanted, filled, strict=True)
-             if len(found) < slot.count]  # fmt: skip
-    if short:
-        raise RuntimeError("slots that could not be filled: " + "; ".join(short))
-    tasks = [task for found in filled for task, _ in found]
-    return tasks, [proof for found in filled for _, proofs in found for proof in proofs]
+        while search:
+            results = pool.map(_fill_star, [(slot, folder) for slot in search])
+            for slot, found in zip(search, tqdm(results, total=len(search), desc="slots", unit="slot"), strict=True):
+                filled[slot.number] = found
+            # A room that is exhausted keeps what it found, and its family's other rooms are asked for the rest.
+            search = moved(list(wanted.values()), {number: len(found) for number, found in filled.items()}, totals)
+            wanted |= {slot.number: slot for slot in search}
+    ordered = [filled[number] for number in sorted(filled)]
+    tasks = [task for found in ordered for task, _ in found]
+    return tasks, [proof for found in ordered for _, proofs in found for proof in proofs]
 
 
 def rebuild(task: Task, solve: bool) -> tuple[Task, tuple[Certificate, ...]]:

@@ -9,7 +9,7 @@ from sim.catalogue import load_catalogue
 from sim.tasks.certificates import budget_of, certificates_text, load_certificates
 from sim.tasks.composition import COMPOSITION
 from sim.tasks.families import FAMILIES
-from sim.tasks.generate import counts, main, named_types, rebuild, slots
+from sim.tasks.generate import Slot, counts, main, moved, named_types, rebuild, slots
 from sim.tasks.sample import BENCHMARK_SEEDS, ROBOTS, TRAIN_ROOMS, room_start, scene_of
 from sim.tasks.task import BENCHMARK_PATH, load_benchmark, tasks_text
 
@@ -20,12 +20,21 @@ CERTIFICATES = {(proof.task, proof.robot): proof for proof in load_certificates(
 def test_composition_is_the_papers_and_the_slots():
     assert Counter(task.category for task in TASKS) == {"single": 60, "optional": 166, "essential": 133}
     assert sum(share.count for share in COMPOSITION) == len(TASKS) == 359
-    assert Counter((task.family, task.room) for task in TASKS) == {(slot.family, slot.room): slot.count for slot in slots()}
-    assert all(seed in slot.seeds for slot in slots() for seed in [t.seed for t in TASKS if _is_of(t, slot)])
+    assert Counter(task.family for task in TASKS) == {share.family: share.count for share in COMPOSITION}
+    made = {(slot.family, slot.room): slot.seeds.start for slot in slots()}
+    assert all(0 <= task.seed - made[task.family, task.room] < 200 for task in TASKS)
 
 
-def _is_of(task, slot):
-    return (task.family, task.room) == (slot.family, slot.room)
+def test_what_a_room_cannot_give_is_taken_from_the_others():
+    rooms = [Slot(number, "lift", room, count) for number, (room, count) in enumerate([("a", 3), ("b", 2), ("c", 0)])]
+    assert moved(rooms, {0: 3, 1: 2, 2: 0}, {"lift": 5}) == []
+    more = moved(rooms, {0: 0, 1: 2, 2: 0}, {"lift": 5})
+    assert [(slot.room, slot.count) for slot in more] == [("b", 4), ("c", 1)]
+    rooms = [rooms[0], *more]
+    last = moved(rooms, {0: 0, 1: 2, 2: 1}, {"lift": 5})
+    assert [(slot.room, slot.count) for slot in last] == [("c", 3)], "neither a nor b is asked again"
+    with pytest.raises(RuntimeError, match="lift: 2 of 5"):
+        moved([*rooms[:2], *last], {0: 0, 1: 2, 2: 1}, {"lift": 5})
 
 
 def test_every_type_takes_part():
