@@ -8,8 +8,8 @@
 A slot is a family in a room. Its seeds are tried in order, and those tasks are kept whose certificates say what their category
 promises (`sim.tasks.certificates`), whose instruction is new, and whose subject has not yet been asked for too often. What a
 room cannot give is taken from the family's other rooms. Both checks print counts per category, family, room, split and type as
-JSON. Generating takes hours on two cores; what has been tried is kept in `outputs/tasks`, by a hash of the simulator's files, so
-that it goes on where it was stopped.
+JSON. Generating takes hours on two cores; what has been tried is kept in `outputs/tasks`, by a hash of the simulator's files,
+so that it goes on where it was stopped.
 """
 
 from __future__ import annotations
