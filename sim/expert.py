@@ -10,7 +10,7 @@ state gets the same step. It is marked privileged in every table; learned planne
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -37,6 +37,8 @@ _REHEARSED: Final = 4
 _PATIENCE: Final = 5
 #: Changes of height that are tried at one stance before another stance is.
 _HEIGHT_TRIALS: Final = 2
+#: Ways of doing one thing after the other that are acted out in thought before the expert gives up.
+_ACTED_OUT: Final = 12
 #: Height above a surface at which a load is carried towards it.
 _OVER_EDGE_M: Final = 0.04
 #: Step back from what a walk ran into, and how often that helps.
@@ -98,16 +100,18 @@ class _Memory:
         refusals: what does not work from where.
         gone: stances tried, by target.
         rehearsed: stances tried in thought.
+        barren: what was tried in thought from where, in vain.
     """
 
     attempts: dict[str, int] = field(default_factory=dict)
     refusals: list[_Refusal] = field(default_factory=list)
     gone: dict[str, set[str]] = field(default_factory=dict)
     rehearsed: int = 0
+    barren: list[tuple[str, _Place]] = field(default_factory=list)
 
     def copy(self) -> _Memory:
         gone = {target: set(tried) for target, tried in self.gone.items()}
-        return _Memory(dict(self.attempts), list(self.refusals), gone, self.rehearsed)
+        return _Memory(dict(self.attempts), list(self.refusals), gone, self.rehearsed, list(self.barren))
 
 
 class Expert:
@@ -318,20 +322,29 @@ class Expert:
         if not pairs or self._count(f"stance {job.target}") >= _PATIENCE:
             return Action("Done")
         present, *heights = self._rehearsal.heights_m()
-        for height in heights:
-            if any(self._rehearsal.leads_to(first, then, None, height) for first, then in pairs):
-                return self._height_change(height - present)
         tried = self._memory.gone.setdefault(job.target, set())
-        for distance, bearing in _STANCES:
-            option = Action("GoTo", object_id=job.target, amount=distance, bearing_deg=bearing)
-            stance = None if option.to_text() in tried else self._rehearsal.stance_of(option)
-            if stance is None:
-                continue
-            for height in (present, *heights):
-                if any(self._rehearsal.leads_to(first, then, stance, height) for first, then in pairs):
-                    tried.add(option.to_text())
-                    return option
+        trials = 0
+        for option, stance in self._stances_for_two(job.target, tried):
+            for height in (present, *heights) if option is not None else heights:
+                for first, then in pairs:
+                    if not self._rehearsal.might_lead_to(first, then, stance, height):
+                        continue
+                    trials += 1
+                    if self._rehearsal.leads_to(first, then, stance, height):
+                        tried.add("" if option is None else option.to_text())
+                        return self._height_change(height - present) if option is None else option
+                    if trials >= _ACTED_OUT:
+                        return Action("Done")
         return Action("Done")
+
+    def _stances_for_two(self, target: str, tried: Collection[str]) -> Iterator[tuple[Action | None, Stance]]:
+        """Where two arms might work on a target: here, without an action, then where walks would end."""
+        yield None, self._session.body.commanded_base()
+        for distance, bearing in _STANCES:
+            option = Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
+            stance = None if option.to_text() in tried else self._rehearsal.stance_of(option)
+            if stance is not None:
+                yield option, stance
 
     def _approach_together(self, head: Job, others: Sequence[Job], facts: Facts) -> Action | None:
         """A walk to where both arms can work at once, None when there is nothing for the other arm or no such place.
@@ -346,17 +359,11 @@ class Expert:
             for arm in self._usable
             if head.arm in (None, arm) and partner.arm in (None, arm.other) and arm.other in self._usable
         ]
-        present, *heights = self._rehearsal.heights_m()
-        options: list[tuple[Action, Stance]] = []
         for target in dict.fromkeys((head.target, partner.target)):
             for distance, bearing in _STANCES[:3]:
                 option = Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
                 stance = self._rehearsal.stance_of(option)
-                if stance is not None:
-                    options.append((option, stance))
-        for height in (present, *heights[:4]):
-            for option, stance in options:
-                if self._rehearsal.works_together(pairs, stance, height):
+                if stance is not None and self._rehearsal.works_together(pairs, stance):
                     return option
         return None
 
@@ -404,14 +411,24 @@ class Expert:
         options = [Action("GoTo", object_id=target, amount=d, bearing_deg=b) for d, b in _STANCES]
         tried = self._memory.gone.setdefault(target, set())
         fresh = [option for option in options if option.to_text() not in tried]
-        for option in fresh[:_REHEARSED]:
+        looked, what = 0, " or ".join(action.to_text() for action in actions)
+        for option in fresh:
+            if looked == _REHEARSED:
+                break
             if self._rehearsals is not None and self._memory.rehearsed >= self._rehearsals:
                 return Action("Done")
-            self._memory.rehearsed += 1
             stance = self._rehearsal.stance_of(option)
-            if stance is not None and self._rehearsal.works(actions, stance):
+            if stance is None:
+                continue
+            place = _Place(stance, self._session.body.pelvis_height_m)
+            if any(what == known and place.near(other) for known, other in self._memory.barren):
+                continue
+            looked += 1
+            self._memory.rehearsed += 1
+            if self._rehearsal.works(actions, stance):
                 tried.add(option.to_text())
                 return option
+            self._memory.barren.append((what, place))
         option = fresh[0] if fresh else options[0]
         tried.add(option.to_text())
         return option
