@@ -27,7 +27,20 @@ from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
 
-__all__ = ["Luck", "grip", "nudge", "pick", "place", "plan_bring", "plan_pick", "plan_place", "reset_arm", "retreat", "stow"]
+__all__ = [
+    "Luck",
+    "grip",
+    "nudge",
+    "pick",
+    "place",
+    "plan_bring",
+    "plan_pick",
+    "plan_place",
+    "reset_arm",
+    "retreat",
+    "stow",
+    "upright",
+]
 
 Array = NDArray[np.float64]
 
@@ -112,7 +125,7 @@ def _carry(body: Body, arm: Arm, held: str) -> Array:
     """
     usual = body.carrying(arm)
     _, hand = body.hand_pose(arm)
-    turn = _upright(body.world.pose(held)[:3, :3])
+    turn = upright(body.world.pose(held)[:3, :3])
     pointing, closing = turn @ hand[:, 0], turn @ hand[:, 1]
     ahead = body.turn_to_world(np.array([1.0, 0.0, 0.0]))
     if np.hypot(*pointing[:2]) > 0.15:
@@ -130,7 +143,7 @@ def _level_way(body: Body, arm: Arm, held: str, goal: Array) -> list[Array]:
     """(A,) postures on the hand's straight way to carrying on which a vessel stays upright, as far as they exist."""
     start, end = body.hand_pose(arm)[0], body.hand_at(arm, goal)
     hand = body.hand_pose(arm)[1]
-    turn = _upright(body.world.pose(held)[:3, :3])
+    turn = upright(body.world.pose(held)[:3, :3])
     pointing, closing = turn @ hand[:, 0], turn @ hand[:, 1]
     way: list[Array] = []
     last = body.commanded_arm(arm)
@@ -325,7 +338,7 @@ def plan_bring(
     position, hand = body.hand_pose(arm)
     pose = body.world.pose(thing.object_id)
     # the object upright again, turned about the vertical only
-    tilt = _upright(pose[:3, :3])
+    tilt = upright(pose[:3, :3])
     middle = pose[:3, 3] if point is None else pose[:3, 3] + pose[:3, :3] @ point
     offset = tilt @ (middle - position)  # object frame from the hand
     pointing, closing = tilt @ hand[:, 0], tilt @ hand[:, 1]
@@ -440,7 +453,7 @@ def _turn_z(angle_rad: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _upright(rotation: Array) -> Array:
+def upright(rotation: Array) -> Array:
     """The smallest rotation that makes the object's z axis vertical again."""
     axis = np.cross(rotation[:, 2], _UP)
     sine, cosine = float(np.linalg.norm(axis)), float(rotation[2, 2])

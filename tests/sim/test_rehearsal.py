@@ -37,7 +37,10 @@ def test_a_drawer_is_imagined_open_before_it_is_opened_in_thought(session):
     stances = [rehearsal.stance_of(Action("GoTo", object_id=DRAWER, bearing_deg=b)) for b in (None, -20.0, 20.0)]
     before, openness = session.world.data.qpos.copy(), session.world.objects[DRAWER].openness
     asked = {
-        (number, height): (rehearsal.might_lead_to(first, then, stance, height), rehearsal.leads_to(first, then, stance, height))
+        (number, height): (
+            rehearsal.might_lead_to(first, then, stance, height),
+            rehearsal.leads_to(first, then, stance, height),
+        )
         for number, stance in enumerate(stances)
         if stance is not None
         for height in rehearsal.heights_m()[:3]
