@@ -37,6 +37,8 @@ __all__ = [
 CERTIFICATES_PATH: Final = Path(__file__).parent / "certificates.jsonl"
 #: Steps beyond the family's typical number that a certified plan may take.
 _EXTRA_STEPS: Final = 6
+#: Stances that a certified plan may need to try in thought; only draws that fail in the end need more, and long for it.
+_REHEARSALS: Final = 12
 
 
 class Refusal(ValueError):  # noqa: N818 - it reports that a draw is no task of the benchmark
@@ -104,7 +106,7 @@ def certify(task: Task, robot: str, arms: Sequence[Arm] = (Arm.RIGHT, Arm.LEFT))
     session = Session(robot, "easy", image_size=0)
     try:
         session.reset(task, seed=task.seed)
-        expert = Expert(session, arms=arms)
+        expert = Expert(session, _REHEARSALS if len(arms) == len(Arm) else None, arms)
         expert.reset()
         while not session.finished:
             session.step(expert.next_step())
