@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from data.records import Action, ActionOutcome, PlanStep
 from sim.aliases import number, to_action
 from sim.failures import FailureCode
+from sim.navigation import wrap_angle
 from sim.poses import interactable_poses, random_placements, set_object_poses
 from sim.rooms import load_room
 from sim.session import FreePlay, Session, SessionSnapshot, TaskLike
@@ -321,8 +322,9 @@ class Controller:
         rotation = call.get("rotation", 0.0)
         if isinstance(rotation, Mapping):  # AI2-THOR: degrees about each axis
             rotation = rotation.get("z", 0.0)
-        yaw = float(np.deg2rad(number("TP", "rotation", rotation)))
-        if not self.session.body.navigation().is_free(np.array([x, y])):
+        yaw = wrap_angle(float(np.deg2rad(np.remainder(number("TP", "rotation", rotation), 360.0))))
+        x0, y0, x1, y1 = self.session.world.room.bounds
+        if not (x0 <= x <= x1 and y0 <= y <= y1) or not self.session.body.navigation().is_free(np.array([x, y])):
             return False
         self._undo.append(self.session.snapshot())
         self._redo.clear()

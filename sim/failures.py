@@ -96,7 +96,9 @@ FAILURES: Final[Mapping[FailureCode, FailureSpec]] = {
     FailureCode.NO_FREE_POSE: FailureSpec(_NAV, "the robot can stand nowhere as asked, or there is no way to get there"),
     FailureCode.BODY_TOO_HIGH: FailureSpec(_BODY, "a lower pelvis at the same stance would reach", ("height_m", "reach_m")),
     FailureCode.BODY_TOO_LOW: FailureSpec(_BODY, "a higher pelvis at the same stance would reach", ("height_m", "reach_m")),
-    FailureCode.HEIGHT_LIMIT: FailureSpec(_BODY, "the legs are already at the end of their range", ("height_m",)),
+    FailureCode.HEIGHT_LIMIT: FailureSpec(
+        _BODY, "the legs are at the end of their range, or an arm runs into something", ("height_m",)
+    ),
     FailureCode.OBJECT_NOT_KNOWN: FailureSpec(_LOGIC, "no object of that name has been seen in this episode"),
     FailureCode.HAND_OCCUPIED: FailureSpec(_LOGIC, "the hand already holds something"),
     FailureCode.HAND_EMPTY: FailureSpec(_LOGIC, "the hand holds nothing"),
@@ -121,7 +123,9 @@ FAILURES: Final[Mapping[FailureCode, FailureSpec]] = {
     FailureCode.SOURCE_OFF: FailureSpec(_LOGIC, "nothing comes out of the source, switch it on"),
     FailureCode.ALREADY_IN_STATE: FailureSpec(_LOGIC, "the object already is in the state that the action makes"),
     FailureCode.ALREADY_HELD: FailureSpec(_LOGIC, "the object is already in a hand"),
-    FailureCode.IN_USE: FailureSpec(_LOGIC, "the object or receptacle is in use by the other arm"),
+    FailureCode.IN_USE: FailureSpec(
+        _LOGIC, "the object or receptacle is in use by the other arm, or a hand at a door or drawer keeps the robot there"
+    ),
     FailureCode.ARM_CONFLICT: FailureSpec(_LOGIC, "the two actions of the step exclude each other"),
     FailureCode.BOTH_HANDS_BUSY: FailureSpec(_LOGIC, "both hands hold one object"),
     FailureCode.OBSTRUCTED: FailureSpec(_LOGIC, "in reach, but no pose of the arm gets there without a collision", ("gap_m",)),

@@ -223,10 +223,10 @@ def rotate(body: Body, action: Action) -> Skill:
 
 
 def change_height(body: Body, action: Action) -> Skill:
-    """MoveUp and MoveDown: bends or stretches the legs, as far as they go.
+    """MoveUp and MoveDown: bends or stretches the legs, as far as they go and as long as the arms run into nothing.
 
     Raises:
-        SkillFailure: HeightLimit, with the part of the change that the legs did not allow, when they could do less than asked.
+        SkillFailure: HeightLimit, with the part of the change that was not made, when they could do less than asked.
     """
     amount = action.amount if action.amount is not None else float(action.spec.amount_default or 0.0)
     start = body.pelvis_height_m
@@ -234,11 +234,19 @@ def change_height(body: Body, action: Action) -> Skill:
     low, high = body.spec.pelvis_height_range_m
     goal = float(np.clip(wanted, low, high))
     way = plan(np.array([[start], [goal]]), HEIGHT_SPEED_M_S, HEIGHT_ACCELERATION_M_S2)
-    time_s = 0.0
-    while time_s < way.duration_s:
-        time_s += CONTROL_DT_S
+    limits = np.maximum(_PUSHED, body.pushed() + 0.5 * _PUSHED)
+    times, retreat = _ticks(way.duration_s), round(_RETREAT_S / CONTROL_DT_S)
+    for tick, time_s in enumerate(times):
         body.command_height(float(way.at(time_s)[0]))
         yield
+        if np.any(body.pushed() > limits):
+            for back_s in reversed(times[max(tick - retreat, 0) : tick]):
+                body.command_height(float(way.at(back_s)[0]))
+                yield
+                if np.all(body.pushed() <= 0.5 * _PUSHED):
+                    break
+            goal = body.pelvis_height_m
+            break
     yield from _settle(body)
     if abs(wanted - goal) > 0.005:
         raise SkillFailure(FailureCode.HEIGHT_LIMIT, {"height_m": wanted - goal})

@@ -437,13 +437,16 @@ def reset_arm(body: Body, action: Action, luck: Luck) -> Skill:
     """ResetArm: back to the ready posture, with the hand open unless it holds something.
 
     Raises:
-        SkillFailure: BothHandsBusy.
+        SkillFailure: BothHandsBusy, or InUse for a hand that is at a door or drawer.
     """
     del luck
     assert action.arm is not None
     if body.lifted is not None:
         raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
-    if body.held[action.arm] is None:
+    held = body.held[action.arm]
+    if held is not None and not body.thing(held).movable:
+        raise SkillFailure(FailureCode.IN_USE)
+    if held is None:
         yield from body.move_hand(action.arm, 1.0)
     yield from stow(body, action.arm)
 

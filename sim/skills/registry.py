@@ -58,7 +58,7 @@ def skills_for(body: Body, step: PlanStep, known: frozenset[str], luck: Luck) ->
             skills.append((action, refuse(FailureCode.ARM_CONFLICT)))
         elif action.object_id is not None and action.object_id not in known:
             skills.append((action, refuse(FailureCode.OBJECT_NOT_KNOWN)))
-        elif action.name in BODY_SKILLS and _holds_furniture(body) and action.name not in ("MoveUp", "MoveDown"):
+        elif action.name in BODY_SKILLS and _holds_furniture(body):
             skills.append((action, refuse(FailureCode.IN_USE)))
         elif action.name in BODY_SKILLS:
             skills.append((action, BODY_SKILLS[action.name](body, action)))
@@ -68,7 +68,7 @@ def skills_for(body: Body, step: PlanStep, known: frozenset[str], luck: Luck) ->
 
 
 def _holds_furniture(body: Body) -> bool:
-    """Whether a hand is at a door or drawer, which walking would tear at."""
+    """Whether a hand is at a door or drawer, which a body on the move would tear at."""
     return any(name is not None and not body.thing(name).movable for name in body.held.values())
 
 

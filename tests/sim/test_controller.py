@@ -65,6 +65,11 @@ def test_save_load_and_teleport(controller):
     assert controller.step(action="TP", x=float(x), y=float(y), rotation=90).metadata["actionReturn"] is True
     assert np.allclose(controller.session.world.base_pose[:2], (x, y))
     assert not controller.step(action="TP", x=99.0, y=0.0).metadata["lastActionSuccess"]
+    assert not controller.step(action="TP", x=1e308, y=0.0).metadata["lastActionSuccess"]
+    for rotation in (1e308, -1e308, 36090.0):
+        assert controller.step(action="TP", x=float(x), y=float(y), rotation=rotation).metadata["lastActionSuccess"]
+        assert abs(controller.session.body.base().yaw_rad) <= np.pi + 1e-6
+    controller.step(action="TP", x=float(x), y=float(y), rotation=90)
     controller.step(action="LoadState", name="here")
     assert not np.allclose(controller.session.world.base_pose[:2], (x, y))
     assert len(controller.step(action="GetReachablePositions").metadata["actionReturn"]) > 10

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data.records import Arm, PlanStep
+from data.records import Arm, FailureCategory, PlanStep
 from sim.robots.build_solver import robot_kit
 from sim.robots.kinematics import root_quaternion
 from sim.session import FreePlay, Session
@@ -109,3 +109,23 @@ def test_a_hand_that_runs_into_a_wall_ends_the_walk(robot: str) -> None:
     assert np.all(body.pushed() < (0.03, 0.05, 0.35))
     _, back = session.step(PlanStep.parse("MoveBack(0.3)"))
     assert back.success, "and the robot can walk away"
+
+
+def test_an_arm_that_runs_into_a_worktop_ends_the_way_down() -> None:
+    session = Session("h1", "easy", image_size=0)
+    session.reset(FreePlay("kitchen_1"), seed=0)
+    body, model, data = session.body, session.world.model, session.world.data
+    session.teleport(2.0, 1.83, np.deg2rad(135.0))
+    start = body.pelvis_height_m
+    _, feedback = session.step(PlanStep.parse("MoveDown(0.3)"))
+    outcome = feedback.outcomes[0]
+    assert outcome.code == "HeightLimit" and outcome.category is FailureCategory.BODY_ADJUSTMENT
+    assert outcome.margins["height_m"] == pytest.approx(-0.3 - (body.pelvis_height_m - start), abs=1e-4)
+    assert -0.3 < body.pelvis_height_m - start < -0.02, "part of the way"
+    joints = [int(model.joint(name).id) for arm in Arm for name in body.spec.arms[arm.value].joints]
+    low, high = model.jnt_range[joints].T
+    at = data.qpos[model.jnt_qposadr[joints]]
+    assert np.all((low - 0.02 < at) & (at < high + 0.02)) and body.pushed()[2] < 0.3
+    _, feedback = session.step(PlanStep.parse("MoveUp(0.05)"))
+    assert feedback.outcomes[0].success, "and the robot can rise again"
+    session.close()
