@@ -164,7 +164,7 @@ def sample_task(
     Args:
         seed: one of `TRAIN_SEEDS` or `BENCHMARK_SEEDS`, whichever belongs to the source.
         room: a room; drawn from those of the source when None.
-        family: a name of `sim.tasks.families.FAMILIES`; drawn when None (category first, then family).
+        family: a name of `sim.tasks.families.FAMILIES`; drawn when None (category and room once, the family until it fits).
         source: `train` or `benchmark`. Training tasks keep to `TRAIN_ROOMS` and do without `UNSEEN_TYPES`.
         robots: robots that have to reach everything the task is about.
 
@@ -175,11 +175,15 @@ def sample_task(
     if seeds is None or seed not in seeds:
         raise ValueError(f"seed {seed} is not a {source} seed; allowed: train {TRAIN_SEEDS}, benchmark {BENCHMARK_SEEDS}")
     without = UNSEEN_TYPES if source == "train" else ()
+    fixed = rng_for("task", source, seed)
+    wanted = str(fixed.choice(TRAIN_ROOMS if source == "train" else ROOMS))
+    category = str(fixed.choice(CATEGORIES))
+    families = [name for name, kind in FAMILIES.items() if kind.category == category]
     for attempt in range(_ATTEMPTS):
         rng = rng_for("task", source, seed, attempt)
-        where = room or str(rng.choice(TRAIN_ROOMS if source == "train" else ROOMS))
-        category = str(rng.choice(CATEGORIES))
-        what = family or str(rng.choice([name for name, kind in FAMILIES.items() if kind.category == category]))
+        another = str(rng.choice(TRAIN_ROOMS if source == "train" else ROOMS))
+        where = room or (wanted if attempt < _ATTEMPTS // 2 else another)  # so that rooms and categories stay balanced
+        what = family or str(rng.choice(families))
         try:
             draft = draw(what, scene_of(where), rng, without=without)
             return settle(draft, f"{source}_{what}_{seed}", seed, source, rng, robots)
