@@ -77,6 +77,20 @@ def test_save_load_and_teleport(controller):
         controller.step(action="LoadState", name="there")
 
 
+def test_a_hand_at_a_door_keeps_the_robot_from_being_teleported(controller):
+    controller.reset()
+    x, y = controller.session.body.navigation().free_positions()[0]
+    for _ in range(4):
+        controller.step(action="RotateLeft", amount=90)  # to see the cabinet
+    for call in ({"action": "GoTo", "objectId": "Cabinet_1"}, {"action": "Hold", "arm": "left", "objectId": "Cabinet_1"}):
+        assert controller.step(call).metadata["lastActionSuccess"]
+    before = controller.session.world.base_pose.copy()
+    assert not controller.step(action="TP", x=float(x), y=float(y)).metadata["lastActionSuccess"]
+    assert np.array_equal(controller.session.world.base_pose, before)
+    controller.step(action="Release", arm="left")
+    assert controller.step(action="TP", x=float(x), y=float(y)).metadata["lastActionSuccess"]
+
+
 @pytest.mark.parametrize(
     ("name", "arguments", "text"),
     [
