@@ -28,7 +28,6 @@ from sim.navigation import wrap_angle
 from sim.poses import interactable_poses, random_placements, set_object_poses
 from sim.rooms import load_room
 from sim.session import FreePlay, Session, SessionSnapshot, TaskLike
-from sim.skills.registry import holds_furniture
 
 __all__ = ["THOR_CODES", "Controller", "Event"]
 
@@ -324,10 +323,8 @@ class Controller:
         if isinstance(rotation, Mapping):  # AI2-THOR: degrees about each axis
             rotation = rotation.get("z", 0.0)
         yaw = wrap_angle(float(np.deg2rad(np.remainder(number("TP", "rotation", rotation), 360.0))))
-        x0, y0, x1, y1 = self.session.world.room.bounds
-        if not (x0 <= x <= x1 and y0 <= y <= y1) or not self.session.body.navigation().is_free(np.array([x, y])):
-            return False
-        if holds_furniture(self.session.body):
+        body = self.session.body
+        if body.at_furniture() or not body.navigation().is_free(np.array([x, y])):
             return False
         self._undo.append(self.session.snapshot())
         self._redo.clear()

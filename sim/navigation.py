@@ -125,6 +125,9 @@ class NavigationMap:
 
     def is_free(self, position: NDArray[np.float64]) -> bool:
         """Whether the base can stand at (2,) metres."""
+        x0, y0, x1, y1 = self.bounds
+        if not (x0 <= position[0] <= x1 and y0 <= position[1] <= y1):  # numbers of any size are refused here
+            return False
         return bool(self.clearance(np.asarray(position, dtype=np.float64)[None, :])[0] >= 0.0)
 
     def segment_free(self, start: NDArray[np.float64], end: NDArray[np.float64], slack_m: float = 0.0) -> bool:

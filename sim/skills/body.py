@@ -397,6 +397,11 @@ class Body:
                 found[Arm(arm)] = name
         return found
 
+    def at_furniture(self, arm: Arm | None = None) -> bool:
+        """Whether a hand, any or the given one, is at a door or drawer, which a body on the move would tear at."""
+        held = self.held.values() if arm is None else (self.held[arm],)
+        return any(name is not None and not self.thing(name).movable for name in held)
+
     @property
     def lifted(self) -> str | None:
         """The object that both hands hold together."""

@@ -9,7 +9,7 @@ Paper: body actions of the DualTHOR action space. GoTo replaces the paper's tele
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Final
 
 import numpy as np
@@ -113,16 +113,26 @@ def _travel(body: Body, way: NDArray[np.float64], limits: NDArray[np.float64] = 
 
 def _retreat(body: Body, way: NDArray[np.float64], legs: NDArray[np.float64]) -> Skill:
     """Goes back along a way until nothing presses, a third of a second at most, and brings the feet together."""
-    tick = len(way) - 1
-    for tick in range(len(way) - 2, max(len(way) - 2 - round(_RETREAT_S / CONTROL_DT_S), -1), -1):
+
+    def command(tick: int) -> None:
         body.command_base(*map(float, way[tick]))
         body.command_legs(legs[tick])
-        yield
-        if np.all(body.pushed() <= 0.5 * _PUSHED):
-            break
+
+    tick = yield from _go_back(body, len(way) - 1, command)
     for share in np.linspace(0.0, 1.0, round(0.3 / CONTROL_DT_S))[1:]:
         body.command_legs((1.0 - share) * legs[tick] + share * legs[0])
         yield
+
+
+def _go_back(body: Body, tick: int, command: Callable[[int], None]) -> Generator[None, None, int]:
+    """Repeats the commands of a motion backwards until nothing presses, a third of a second at most; returns the last tick."""
+    for earlier in reversed(range(max(tick - round(_RETREAT_S / CONTROL_DT_S), 0), tick)):
+        tick = earlier
+        command(tick)
+        yield
+        if np.all(body.pushed() <= 0.5 * _PUSHED):
+            break
+    return tick
 
 
 def _settle(body: Body) -> Skill:
@@ -235,16 +245,12 @@ def change_height(body: Body, action: Action) -> Skill:
     goal = float(np.clip(wanted, low, high))
     way = plan(np.array([[start], [goal]]), HEIGHT_SPEED_M_S, HEIGHT_ACCELERATION_M_S2)
     limits = np.maximum(_PUSHED, body.pushed() + 0.5 * _PUSHED)
-    times, retreat = _ticks(way.duration_s), round(_RETREAT_S / CONTROL_DT_S)
-    for tick, time_s in enumerate(times):
-        body.command_height(float(way.at(time_s)[0]))
+    heights = [float(way.at(time_s)[0]) for time_s in _ticks(way.duration_s)]
+    for tick, height_m in enumerate(heights):
+        body.command_height(height_m)
         yield
         if np.any(body.pushed() > limits):
-            for back_s in reversed(times[max(tick - retreat, 0) : tick]):
-                body.command_height(float(way.at(back_s)[0]))
-                yield
-                if np.all(body.pushed() <= 0.5 * _PUSHED):
-                    break
+            yield from _go_back(body, tick, lambda earlier: body.command_height(heights[earlier]))
             goal = body.pelvis_height_m
             break
     yield from _settle(body)

@@ -414,10 +414,9 @@ def reset_arm(body: Body, action: Action, luck: Luck) -> Skill:
     assert action.arm is not None
     if body.lifted is not None:
         raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
-    held = body.held[action.arm]
-    if held is not None and not body.thing(held).movable:
+    if body.at_furniture(action.arm):
         raise SkillFailure(FailureCode.IN_USE)
-    if held is None:
+    if body.held[action.arm] is None:
         yield from body.move_hand(action.arm, 1.0)
     yield from stow(body, action.arm)
 

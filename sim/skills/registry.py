@@ -13,7 +13,7 @@ from sim.skills.manipulate import Luck
 from sim.skills.push import Push
 from sim.skills.runner import Skill, refuse
 
-__all__ = ["ARM_SKILLS", "BODY_SKILLS", "assess_action", "excludes", "holds_furniture", "skills_for"]
+__all__ = ["ARM_SKILLS", "BODY_SKILLS", "assess_action", "excludes", "skills_for"]
 
 #: Skills of the base and the legs.
 BODY_SKILLS: Final[Mapping[str, Callable[[Body, Action], Skill]]] = {
@@ -58,18 +58,13 @@ def skills_for(body: Body, step: PlanStep, known: frozenset[str], luck: Luck) ->
             skills.append((action, refuse(FailureCode.ARM_CONFLICT)))
         elif action.object_id is not None and action.object_id not in known:
             skills.append((action, refuse(FailureCode.OBJECT_NOT_KNOWN)))
-        elif action.name in BODY_SKILLS and holds_furniture(body):
+        elif action.name in BODY_SKILLS and body.at_furniture():
             skills.append((action, refuse(FailureCode.IN_USE)))
         elif action.name in BODY_SKILLS:
             skills.append((action, BODY_SKILLS[action.name](body, action)))
         else:
             skills.append((action, ARM_SKILLS[action.name](body, action, luck)))
     return skills
-
-
-def holds_furniture(body: Body) -> bool:
-    """Whether a hand is at a door or drawer, which a body on the move would tear at."""
-    return any(name is not None and not body.thing(name).movable for name in body.held.values())
 
 
 def excludes(body: Body, step: PlanStep, known: frozenset[str]) -> bool:
