@@ -1,7 +1,7 @@
 """How deep a robot's posture presses it into itself, by MuJoCo's collision test on the primitive shapes of its own description.
 
 It measures what `data.retarget` avoids with other shapes (`sim.robots.self_collision`), so that the measure is not the method's
-own. Neighbours do not count: bodies with at most two joints between them, a thigh and the pelvis, and pairs that overlap in the
+own. Neighbours do not count: bodies with at most two joints between them, a thigh and the pelvis, parts of one hand, and pairs that overlap in the
 standing posture.
 
 Paper: none; the definition is common practice for retargeted motion (non-adjacent contact deeper than a centimetre).
@@ -51,6 +51,9 @@ class SelfContact:
             body = int(model.joint(joint).bodyid[0])
             if len(self._joints_above(body) ^ self._joints_above(root)) <= _HIP_JOINTS:
                 self._near[root, body] = self._near[body, root] = True
+        for arm in spec.arms.values():  # a closed hand touches itself
+            hand = [int(model.joint(name).bodyid[0]) for name in arm.hand_joints]
+            self._near[np.ix_(hand, hand)] = True
         low, high = spec.pelvis_height_range_m
         standing = robot.arm_posture(crouch(robot, high - 0.06 * (high - low) - 0.01).q, "rest")
         for a, b, _ in self._contacts(np.array([0.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0]), standing):
