@@ -52,7 +52,8 @@ class SelfContact:
             if len(self._joints_above(body) ^ self._joints_above(root)) <= _HIP_JOINTS:
                 self._near[root, body] = self._near[body, root] = True
         for arm in spec.arms.values():  # a closed hand touches itself
-            hand = [int(model.joint(name).bodyid[0]) for name in arm.hand_joints]
+            fingers = {int(model.joint(name).bodyid[0]) for name in arm.hand_joints}
+            hand = [body for body in range(model.nbody) if fingers & self._joints_above(body)]
             self._near[np.ix_(hand, hand)] = True
         low, high = spec.pelvis_height_range_m
         standing = robot.arm_posture(crouch(robot, high - 0.06 * (high - low) - 0.01).q, "rest")
