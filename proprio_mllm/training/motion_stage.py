@@ -114,7 +114,7 @@ def tokenizer_metrics(tokenizer: MotionTokenizer, windows: MotionWindows, seed: 
         result[f"{name}_hand_state"] = float(hands.double().mean())
         result[f"{name}_count"] = float(len(rows))
     sample = torch.from_numpy(windows.draw(rng, 512)).to(tokenizer.mean.device)
-    counts = torch.bincount(tokenizer.encode(sample).flatten(), minlength=tokenizer.cfg.codes).double()
+    counts = torch.bincount(tokenizer.encode(sample).flatten(), minlength=tokenizer.cfg.vocabulary).double()
     share = counts / counts.sum()
     result["codes_used"] = float((counts > 0).double().mean())
     result["perplexity"] = float(torch.exp(-(share[share > 0] * share[share > 0].log()).sum()))
