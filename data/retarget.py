@@ -1,14 +1,15 @@
 """Retargets human motion to a robot: Gauss-Newton on Pinocchio, a few iterations per frame from the previous frame's solution.
 
 For each frame, with q the configuration (floating base included), W the weights and r the residuals below, it iterates
-`q <- q ⊕ -(JᵀWJ + λ)⁻¹ JᵀWr`, with joints held at the bounds that joint limits and joint velocity give.
+`q <- q ⊕ -(JᵀWJ + λ)⁻¹ JᵀWr`, with joints held at the bounds that joint limits and joint velocity give (`data.least_squares`).
 
 Residuals, against `data.targets`: place and orientation of both soles (flat, locked during contact), place and orientation
 of the pelvis (orientation from the human trunk, height lowered until both legs reach), and for each arm the vectors shoulder
-to elbow and elbow to wrist, which are the robot's bone lengths along the human's directions.
+to elbow and elbow to wrist, which are the robot's bone lengths along the human's directions. Corners of the soles below the
+floor, and parts of the robot that come too near to each other, are residuals as well.
 Shape letters: T frames, J joints. Frames: world, z up, floor at 0.
 
-Paper: data preparation, "retargeted to the robot". Left out: hands' orientation, objects, self-collision as a constraint.
+Paper: data preparation, "retargeted to the robot". Left out: hands' orientation, objects.
 Run `python -m data.retarget report` for a table of metrics.
 """
 
@@ -23,6 +24,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from data.least_squares import BoundedSearch
 from data.motion import FPS, encode_frames, resample
 from data.records import Motion
 from data.self_contact import SelfContact
@@ -120,6 +122,9 @@ class Retargeter:
         ]
         self._apart = _Apart(self.robot)
         self._measure()
+        self._search = BoundedSearch(
+            model, self._q_columns, self._v_columns, self._prior, self._reference[self._q_columns], _DAMPING
+        )
 
     @cached_property
     def self_contact(self) -> SelfContact:
@@ -218,33 +223,8 @@ class Retargeter:
         if t > 0:
             step = MAX_JOINT_VELOCITY / FPS * 0.999
             lower, upper = np.maximum(lower, q[self._q_columns] - step), np.minimum(upper, q[self._q_columns] + step)
-        columns = self._v_columns
-        best, damping = q, _DAMPING
-        cost = np.inf
-        hessian = gradient = np.empty(0)
-        for _ in range(_FIRST_ITERATIONS if t == 0 else self.iterations):
-            jacobian, residual = self._system(q, targets, t)
-            away = q[self._q_columns] - self._reference[self._q_columns]
-            new = float(residual @ residual + (self._prior * away) @ (self._prior * away))
-            if new <= cost:
-                if new > 0.999 * cost:
-                    best = q
-                    break
-                best, cost, damping = q, new, max(damping * 0.3, _DAMPING)
-                hessian = jacobian.T @ jacobian
-                gradient = jacobian.T @ residual
-                gradient[6:] += self._prior**2 * away
-                hessian.flat[6 * len(columns) + 6 :: len(columns) + 1] += self._prior**2
-            else:
-                damping *= 10.0
-            step = np.zeros(self.robot.model.nv)
-            here = best[self._q_columns]
-            damped = hessian.copy()
-            damped.flat[:: len(columns) + 1] += damping
-            step[columns] = _bounded_step(damped, gradient, lower - here, upper - here)
-            q = pin.integrate(self.robot.model, best, step)
-            q[self._q_columns] = np.clip(q[self._q_columns], lower, upper)
-        return best
+        iterations = _FIRST_ITERATIONS if t == 0 else self.iterations
+        return self._search(q, lambda at: self._system(at, targets, t), lower, upper, iterations)
 
     def _system(self, q: Array, targets: Targets, t: int) -> tuple[Array, Array]:
         model, data = self.robot.model, self.robot.data
@@ -347,24 +327,6 @@ def _leg_side(robot: RobotModel, joint: int) -> str:
     legs = robot.spec.leg_joints
     half = len(legs) // 2
     return next((side for side, names in zip(SIDES, (legs[:half], legs[half:]), strict=True) if above & set(names)), "")
-
-
-def _bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) -> Array:
-    """Newton step whose joint part (all but the first six entries) stays within bounds; joints that would leave are held."""
-    step: Array = -np.linalg.solve(hessian, gradient).astype(np.float64)
-    held = np.zeros(len(step), dtype=bool)
-    for _ in range(3):
-        joints = step[6:]
-        outside = np.concatenate([np.zeros(6, dtype=bool), (joints < lower - 1e-12) | (joints > upper + 1e-12)])
-        if not outside.any():
-            break
-        held |= outside
-        step[6:] = np.clip(joints, lower, upper)
-        free = ~held
-        right = -gradient[free] - hessian[np.ix_(free, held)] @ step[held]
-        step[free] = np.linalg.solve(hessian[np.ix_(free, free)], right)
-    step[6:] = np.clip(step[6:], lower, upper)
-    return step
 
 
 def _distance(a: Array, b: Array) -> float:
