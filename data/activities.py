@@ -388,7 +388,9 @@ def close_door(script: Script) -> Phrases:
     height = _choice(script, ["at waist height", "at chest height"])
     z = float(script.rng.uniform(*HEIGHTS[height]))
     hinge, radius = np.array([0.5, 0.42 * sign]), 0.4
-    arc = [np.array([hinge[0] - radius * np.sin(a), hinge[1] - sign * radius * np.cos(a), z]) for a in np.linspace(0.8, 0.05, 5)]
+    arc = [
+        np.array([hinge[0] - radius * np.sin(a), hinge[1] - sign * radius * np.cos(a), z]) for a in np.linspace(0.8, 0.05, 5)
+    ]
     script.grip(side, 0.5)
     _go(script, {side: arc[0]}, float(script.rng.uniform(0.8, 1.1)))
     start, total = script.time_s, float(script.rng.uniform(0.9, 1.4))

@@ -1,7 +1,7 @@
 """Joint angles of a robot from motion features: the way back from key bodies, for clips that come out of the motion tokenizer.
 
-Every frame is solved from the one before it: configurations whose key bodies are where the features have them, in the pelvis heading
-frame, with the pelvis free to lean. What the key bodies do not show (the roll of a wrist) stays at rest.
+Every frame is solved from the one before it: configurations whose key bodies are where the features have them, in the pelvis
+heading frame, with the pelvis free to lean. What the key bodies do not show (the roll of a wrist) stays at rest.
 
 Shape letters: T frames, F features, K key bodies, J joints. Paper: none; it shows what tokens keep of a robot's posture.
 """

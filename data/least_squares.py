@@ -1,7 +1,8 @@
 """Levenberg-Marquardt steps for a floating-base robot whose joints stay within bounds.
 
-A step minimises |J dq + r|² + |prior (q + dq - rest)|² + λ |dq|². It is kept when the cost falls, and λ falls with it; otherwise it
-is taken back and λ grows. Without that, a leg that is almost straight, where the model is far off, throws the next frames about.
+A step minimises |J dq + r|² + |prior (q + dq - rest)|² + λ |dq|². It is kept when the cost falls, and λ falls with it;
+otherwise it is taken back and λ grows. Without that, a leg that is almost straight, where the model is far off, throws the
+next frames about.
 
 Shape letters: R residuals, N velocities (six of the base, then joints). Paper: none; the common damped Gauss-Newton scheme.
 """
@@ -56,7 +57,8 @@ class BoundedSearch:
         Args:
             q: where to start.
             system: what is minimised.
-            lower, upper: (N - 6,) bounds of the joints.
+            lower: (N - 6,) least joints.
+            upper: (N - 6,) greatest joints.
             iterations: evaluations of the system.
         """
         best, damping, cost = q, self._damping, np.inf

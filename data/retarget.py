@@ -45,7 +45,16 @@ _LEAST_KNEE_RAD: Final = 0.05
 _DAMPING: Final = 0.3
 _POSTURE_WEIGHT: Final = 0.03
 _HIP_YAW_WEIGHT: Final = 0.12
-_WEIGHTS: Final = {"sole": 20.0, "sole_rotation": 3.0, "pelvis": 6.0, "pelvis_rotation": 2.0, "arm": 4.0, "shoulders": 2.0, "floor": 20.0, "apart": 20.0}
+_WEIGHTS: Final = {
+    "sole": 20.0,
+    "sole_rotation": 3.0,
+    "pelvis": 6.0,
+    "pelvis_rotation": 2.0,
+    "arm": 4.0,
+    "shoulders": 2.0,
+    "floor": 20.0,
+    "apart": 20.0,
+}
 _DEFAULT_OPENING: Final = 0.6
 _APART_M: Final = 0.01
 _DEEPEST_M: Final = 0.03
@@ -272,8 +281,8 @@ class Retargeter:
 class _Apart:
     """Residuals of parts of a robot that come too close: arms to the rest and to each other, legs to each other.
 
-    The arms' shapes are those of `sim.robots.self_collision`, with the hands' neighbours there counted here; shins and feet, which
-    nothing else needs, are capsules around the description's geoms.
+    The arms' shapes are those of `sim.robots.self_collision`, with the hands' neighbours there counted here; shins and feet,
+    which nothing else needs, are capsules around the description's geoms.
     """
 
     def __init__(self, robot: RobotModel) -> None:

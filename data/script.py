@@ -32,7 +32,8 @@ _SWING_HEIGHT_M: Final = 0.075
 _DRIFT_M: Final = 0.012
 _DRIFT_RAD: Final = 0.03
 _DRIFT_HZ: Final = (0.08, 0.45)
-#: While walking: weight over the standing foot (m), rise and fall of the pelvis (m), chest against the swing of the hands (rad/m).
+#: While walking: weight over the standing foot (m), rise and fall of the pelvis (m), chest against the swing of the hands
+#: (rad/m).
 _SWAY_M: Final = 0.028
 _BOB_M: Final = 0.012
 _COUNTER_RAD_M: Final = 0.5

@@ -1,8 +1,8 @@
 """How deep a robot's posture presses it into itself, by MuJoCo's collision test on the primitive shapes of its own description.
 
-It measures what `data.retarget` avoids with other shapes (`sim.robots.self_collision`), so that the measure is not the method's
-own. Neighbours do not count: bodies with at most two joints between them, a thigh and the pelvis, parts of one hand, and pairs that overlap in the
-standing posture.
+It measures what `data.retarget` avoids with other shapes (`sim.robots.self_collision`), so that the measure is not the
+method's own. Neighbours do not count: bodies with at most two joints between them, a thigh and the pelvis, parts of one hand,
+and pairs that overlap in the standing posture.
 
 Paper: none; the definition is common practice for retargeted motion (non-adjacent contact deeper than a centimetre).
 """

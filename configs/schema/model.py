@@ -151,9 +151,13 @@ class MotionTokenizerConfig:
         _require(self.window % self.stride == 0, f"window {self.window} must be a multiple of {self.stride}")
 
         grid = math.prod(self.levels)
-        _require(self.quantizer != "fsq" or grid == self.codes, f"levels {self.levels} make {grid} codes, not codes {self.codes}")
+        _require(
+            self.quantizer != "fsq" or grid == self.codes, f"levels {self.levels} make {grid} codes, not codes {self.codes}"
+        )
         _require(min(self.levels, default=0) > 2, f"levels {self.levels} must each be at least 3")
-        _require(self.quantizer == "vq" or self.update == "ema", f"update {self.update!r} is for quantizer vq, not {self.quantizer}")
+        _require(
+            self.quantizer == "vq" or self.update == "ema", f"update {self.update!r} is for quantizer vq, not {self.quantizer}"
+        )
 
     @property
     def stride(self) -> int:

@@ -1,9 +1,10 @@
 """Motion VQ-VAE: windows of motion features to discrete tokens and back (paper: stage 1, motion tokenizer).
 
 A 1-D convolutional encoder halves the frame rate `down` times, a quantiser (`quantizer.py`) turns each step into tokens, a
-mirrored decoder rebuilds the features. Loss, as in the paper: reconstruction + alpha * codebook + beta * commitment, and optionally a smooth-L1 term on frame
-differences (MotionGPT's "velocity" term, here true finite differences in metres per frame). D(z) means D(e) with the
-straight-through gradient. Features are normalised by the mean and deviation stored with the weights.
+mirrored decoder rebuilds the features. Loss, as in the paper: reconstruction + alpha * codebook + beta * commitment, and
+optionally a smooth-L1 term on frame differences (MotionGPT's "velocity" term, here true finite differences in metres per
+frame). D(z) means D(e) with the straight-through gradient. Features are normalised by the mean and deviation stored with the
+weights.
 
 Every window is padded with copies of its own first and last frame only, so a window encodes to the same tokens
 online and from a shard.

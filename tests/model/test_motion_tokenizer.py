@@ -20,7 +20,15 @@ def _motion(batch: int = 4, frames: int = 16, seed: int = 0) -> torch.Tensor:
 
 
 def _quantizer(**changes: object) -> MotionQuantizer:
-    sizes: dict[str, object] = {"features": 5, "window": 16, "codes": 7, "code_dim": 3, "width": 8, "depth": 2, "reset_below": 0.0}
+    sizes: dict[str, object] = {
+        "features": 5,
+        "window": 16,
+        "codes": 7,
+        "code_dim": 3,
+        "width": 8,
+        "depth": 2,
+        "reset_below": 0.0,
+    }
     torch.manual_seed(0)
     return MotionQuantizer(build(MotionTokenizerConfig, sizes | changes, "motion")).train()
 
