@@ -22,6 +22,7 @@ from typing import Any, Final
 import numpy as np
 
 from configs.schema.data import DataConfig, ReplayConfig
+from data.cluster import ray_instance
 from data.filter import apply_phc_list, automatic_rule, gate
 from data.generator import GENERATOR_VERSION, write_dataset
 from data.humanml3d import DatasetError, list_clips, load_clip
@@ -37,6 +38,8 @@ __all__ = ["PartResult", "Pictures", "Replay", "build_clips", "dataset_folder", 
 
 #: Raised when the same configuration gives other shards than before.
 _VERSION: Final = 1
+#: Fields that do not decide what is in the shards.
+_NOT_CONTENT: Final = ("workers", "path", "scheduler", "ray_address")
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +189,11 @@ def build_clips(
         clips = clips[: cfg.clips]
     if not clips:
         raise DatasetError(f"{folder}: no clip in {', '.join(cfg.splits)}")
-    keyed = {key: value for key, value in dataclasses.asdict(cfg).items() if key not in ("workers", "path")}
+    keyed = {
+        key: value
+        for key, value in dataclasses.asdict(cfg).items()
+        if key not in ("workers", "path", "scheduler", "ray_address")
+    }
     keyed |= {
         "version": _VERSION,
         "generator": GENERATOR_VERSION,
@@ -215,6 +222,9 @@ def build_clips(
 def _computed(
     cfg: DataConfig, folder: Path, parts: Sequence[Sequence[tuple[str, str]]], missing: Sequence[int], replay: Replay | None
 ) -> Iterator[tuple[int, PartResult]]:
+    if cfg.scheduler == "ray":
+        yield from _on_ray(cfg, folder, parts, missing, replay)
+        return
     if cfg.workers == 1 or len(missing) < 2:
         for index in missing:
             yield index, part_of_clips(cfg, folder, parts[index], replay)
@@ -224,6 +234,23 @@ def _computed(
         futures = {pool.submit(part_of_clips, cfg, folder, parts[index], replay): index for index in missing}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()
+
+
+def _on_ray(
+    cfg: DataConfig, folder: Path, parts: Sequence[Sequence[tuple[str, str]]], missing: Sequence[int], replay: Replay | None
+) -> Iterator[tuple[int, PartResult]]:
+    """Parts computed on a Ray instance; one whose worker dies is computed again (Ray's own retries)."""
+    with ray_instance(cfg.workers, cfg.ray_address) as ray:
+        work = ray.remote(part_of_clips).options(num_cpus=1, max_retries=2)
+        waiting = list(missing)
+        running: dict[Any, int] = {}
+        while waiting or running:
+            while waiting and len(running) < 2 * max(cfg.workers, 1):  # no more than can be written while they come in
+                index = waiting.pop(0)
+                running[work.remote(cfg, folder, parts[index], replay)] = index
+            done, _ = ray.wait(list(running))
+            for reference in done:
+                yield running.pop(reference), ray.get(reference)
 
 
 def _notes(result: PartResult) -> dict[str, Any]:

@@ -81,6 +81,9 @@ class DataConfig:
         iterations: solver iterations per frame.
         part_size: clips per part file.
         workers: processes; 1 stays in this one.
+        scheduler: who runs the workers, `local` processes or `ray`; with `ray` on a cluster, `workers` says how many parts are
+            computed at a time.
+        ray_address: a running Ray cluster that shares the data set's folder; None starts Ray on this machine for the run.
         gates: what a clip must satisfy.
         replay: pictures.
     """
@@ -96,6 +99,8 @@ class DataConfig:
     iterations: int = 3
     part_size: int = 24
     workers: int = 2
+    scheduler: Literal["local", "ray"] = "local"
+    ray_address: str | None = None
     gates: GateConfig = field(default_factory=GateConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
