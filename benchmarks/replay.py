@@ -1,11 +1,11 @@
-"""What clips cost to make: retargeting, metrics, replay with pictures, and writing; and what the paper's 11,955 clips would cost.
+"""What clips cost to make, from retargeting to the written shard, and what the paper's 11,955 clips would cost.
 
     python benchmarks/replay.py [--clips 24] [--pictures-per-s 1] [--size 112] [--out FILE]
 
 Clips are generated, of 2 to 10 s, made for both robots in one process and on one thread, without and with pictures; the
-difference is the replay. The first clip of each robot and room pays for compiling the room and is timed apart. On paper: seconds
-per clip and robot, times 11,955 clips times two robots, over the cores; parts do not depend on one another, so that only the
-compilation on every core and the last part's length come on top.
+difference is the replay. The first clip of each robot and room pays for compiling the room and is timed apart. On paper:
+seconds per clip and robot, times 11,955 clips times two robots, over the cores; parts do not depend on one another, so that
+only the compilation on every core and the last part's length come on top.
 """
 
 from __future__ import annotations

@@ -18,12 +18,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from configs.validate import ConfigError
@@ -35,10 +33,11 @@ from data.shards import ShardError
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.report.arguments import read_named
 from proprio_mllm.training.motion_stage import codebook_use, reconstruction_metrics
+from proprio_mllm.training.reconstruction import draw_use
 from proprio_mllm.training.sources import Clips
 from sim.robots.spec import available_robots, load_robot
 
-__all__ = ["Options", "Row", "draw_use", "evaluate_tokenizer", "main", "real_windows", "table", "windows_of"]
+__all__ = ["Options", "Row", "evaluate_tokenizer", "main", "real_windows", "table", "windows_of"]
 
 _HEADINGS: Final = (
     "tokenizer", "codes", "bits/s", "clips", "MPJPE mm", "hands mm", "feet mm", "velocity mm/s", "joints °", "used %",
@@ -181,21 +180,6 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw_use(rows: Sequence[Row]) -> Figure:
-    """Share of each token over its rank, one line per row; where a line ends, no code is used any more."""
-    figure = Figure(figsize=(7.0, 4.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes: Any = figure.add_subplot()
-    for row in rows:
-        counts = np.sort(row.use[row.use > 0])[::-1]
-        label = f"{row.name}, {row.clips}: {100.0 * float((row.use > 0).mean()):.0f} % of {len(row.use)}"
-        axes.plot(np.arange(1, len(counts) + 1), 100.0 * counts / counts.sum(), label=label)
-    axes.set(xlabel="codes by how often they occur", ylabel="share of the tokens, %", yscale="log")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    return figure
-
-
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 1 when an input is missing, 2 on wrong arguments."""
     try:
@@ -222,7 +206,8 @@ def main(arguments: Sequence[str]) -> int:
         write_text(Path(options.out), text)
     if options.figure:
         Path(options.figure).parent.mkdir(parents=True, exist_ok=True)
-        draw_use(rows).savefig(options.figure, dpi=100)
+        lines = [(f"{row.name}, {row.clips}", row.use) for row in rows]
+        draw_use(lines).savefig(options.figure, dpi=100)
     return 0
 
 
