@@ -24,12 +24,13 @@ import numpy as np
 from configs.schema.data import DataConfig, ReplayConfig
 from data.filter import apply_phc_list, automatic_rule, gate
 from data.generator import GENERATOR_VERSION, write_dataset
-from data.humanml3d import DatasetError, list_clips, load_clip
+from data.humanml3d import DatasetError
 from data.metrics import Metrics, evaluate
 from data.motion import FPS
 from data.records import Motion
 from data.retarget import Retargeter
 from data.shards import Manifest, ShardWriter, config_hash
+from data.sources import clip_ids, read_clip
 from data.workers import start_worker
 from sim.robots.spec import load_robot
 
@@ -83,7 +84,7 @@ class PartResult:
 
 def dataset_folder(cfg: DataConfig, out: Path) -> Path:
     """The folder that clips are read from; generated clips are made when they are not there."""
-    if cfg.source == "humanml3d":
+    if cfg.source != "generated":
         assert cfg.path is not None
         return Path(cfg.path).expanduser()
     folder = Path(cfg.path) if cfg.path else out.parent / f"generated-{cfg.clips}-{cfg.seed}"
@@ -109,7 +110,7 @@ def part_of_clips(cfg: DataConfig, folder: Path, clips: Sequence[tuple[str, str]
     seconds = 0.0
     for name, split in clips:
         try:
-            human = load_clip(folder, name, split)
+            human = read_clip(cfg, folder, name, split)
         except DatasetError as error:
             result.dropped.append((name, "", str(error)))
             continue
@@ -181,12 +182,10 @@ def build_clips(
         data.shards.ShardError: when the folder holds shards of another configuration and `overwrite` is off.
     """
     folder = dataset_folder(cfg, out)
-    clips = [(name, split) for name, split in list_clips(folder, cfg.splits) if cfg.mirrored or not name.startswith("M")]
-    if cfg.source == "humanml3d" and cfg.clips:
-        clips = clips[: cfg.clips]
+    clips = clip_ids(cfg, folder)
     if not clips:
         raise DatasetError(f"{folder}: no clip in {', '.join(cfg.splits)}")
-    keyed = {key: value for key, value in dataclasses.asdict(cfg).items() if key not in ("workers", "path")}
+    keyed = {key: value for key, value in dataclasses.asdict(cfg).items() if key not in ("workers", "path", "body_models")}
     keyed |= {
         "version": _VERSION,
         "generator": GENERATOR_VERSION,
