@@ -17,11 +17,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data.contacts import contact_runs
 from data.humanml3d import DatasetError, check_joints
 from data.motion import FPS, resample
 from data.skeleton import HumanMotion, index
 
-__all__ = ["find_demo_clips", "load_mocap", "load_omomo", "on_floor"]
+__all__ = ["find_demo_clips", "level_parts", "load_mocap", "load_omomo", "on_floor"]
 
 Array = NDArray[np.float64]
 _OMOMO_FPS: Final = 30.0
@@ -33,6 +34,11 @@ _MOCAP_FPS: Final = 120.0
 _FROM_MOCAP: Final = (0, 43, 47, 1, 44, 48, 2, 45, 49, 2, 46, 50, 3, 5, 24, 4, 6, 25, 7, 26, 8, 27)
 
 _TOE_M: Final = 0.02
+#: When a person is on the floor and upright: toes, pelvis as a share of its standing height, shortest part.
+_LOW_TOE_M: Final = 0.08
+_HIGH_TOE_M: Final = 0.30
+_UPRIGHT: Final = 0.65
+_LEAST_S: Final = 1.0
 
 
 def find_demo_clips() -> list[Path]:
@@ -86,6 +92,35 @@ def on_floor(joints: Array) -> Array:
     """Joints (T, 22, 3), z up, moved so that the toes rest 2 cm above 0: a low quantile, robust to single bad frames."""
     floor = float(np.quantile(joints[:, [index("left_foot"), index("right_foot")], 2].min(axis=1), 0.05)) - _TOE_M
     return joints - np.array([0.0, 0.0, floor])
+
+
+def level_parts(motion: HumanMotion) -> list[HumanMotion]:
+    """The parts of a long capture in which the person is on the floor and upright, in order, without captions.
+
+    Both feet are near the floor (the lower toe under 8 cm, the higher under 30 cm), and the pelvis is above 0.65 of its median
+    height over the frames with such feet, for at least 1 s. What lies between is climbing, kneeling or lying, which no floor
+    at 0 explains.
+
+    Returns:
+        Clips called `NAME[START:END]`, frames of the capture.
+    """
+    toes = motion.joints[:, [index("left_foot"), index("right_foot")], 2]
+    pelvis = motion.joints[:, 0, 2]
+    near = (toes.min(axis=1) < _LOW_TOE_M) & (toes.max(axis=1) < _HIGH_TOE_M)
+    if not near.any():
+        return []
+    level = near & (pelvis > _UPRIGHT * np.median(pelvis[near]))
+    runs = [(start, end) for start, end in contact_runs(level) if end - start >= _LEAST_S * motion.fps]
+    return [
+        HumanMotion(
+            f"{motion.name}[{start}:{end}]",
+            motion.joints[start:end],
+            motion.fps,
+            hand_opening=None if motion.hand_opening is None else motion.hand_opening[start:end],
+            split=motion.split,
+        )
+        for start, end in runs
+    ]
 
 
 def _checked(path: Path, joints: Array) -> HumanMotion:

@@ -1,7 +1,7 @@
 """Table of retargeting metrics: `python -m data.retarget report [clips]`.
 
-Columns: generated clips per robot, and each real clip that `make motions` installed. What the project aims at is in the
-last column.
+Columns: generated clips per robot, and what `make motions` installed: each OMOMO clip, and the parts of the climbing clips on
+level floor together (weighted by frames). What the project aims at is in the last column.
 
 Paper: none.
 """
@@ -20,7 +20,7 @@ from rich.table import Table
 
 from data.generator import generate_clip
 from data.metrics import Metrics, evaluate
-from data.omomo import find_demo_clips, load_omomo
+from data.omomo import find_demo_clips, level_parts, load_mocap, load_omomo
 from data.retarget import Retargeter
 from data.skeleton import HumanMotion
 from sim.robots.spec import available_robots, load_robot
@@ -88,11 +88,14 @@ def main(arguments: Sequence[str]) -> int:
         return 2
     count = max(1, int(arguments[1])) if len(arguments) == 2 else 72
     real = [load_omomo(path) for path in find_demo_clips() if path.suffix == ".pt"]
+    level = [part for path in find_demo_clips() if path.suffix == ".npy" for part in level_parts(load_mocap(path))]
     columns: list[tuple[str, Metrics, float]] = []
     for robot in available_robots():
         retargeter = Retargeter(load_robot(robot))
         columns.append((f"{robot} generated", *measure(retargeter, (generate_clip(0, i) for i in range(count)))))
         columns += [(f"{robot} {clip.name}", *measure(retargeter, [clip])) for clip in real]
+        if level:
+            columns.append((f"{robot} climb, level parts", *measure(retargeter, level)))
     console = Console()
     console.print(table(columns))
     if not real:
