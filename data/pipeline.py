@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 
 from configs.schema.data import DataConfig, ReplayConfig
-from data.filter import apply_phc_list, automatic_rule, gate
+from data.filter import admit, gate, reason_group
 from data.generator import GENERATOR_VERSION, write_dataset
 from data.humanml3d import DatasetError
 from data.metrics import Metrics, evaluate
@@ -72,10 +72,12 @@ Replay = Callable[[Motion, ReplayConfig, int], Pictures | None]
 
 @dataclass(frozen=True, slots=True)
 class PartResult:
-    """Rows of one part, what was dropped and why, and the metrics of what was kept."""
+    """Rows of one part, what was dropped and why, what PHC's list cut short, and the metrics of what was kept."""
 
+    clips: int
     rows: list[dict[str, Any]]
     dropped: list[tuple[str, str, str]]
+    truncated: list[str]
     metrics: list[tuple[str, Metrics]]
     without_pictures: int
     retarget_s: float
@@ -105,7 +107,7 @@ def part_of_clips(cfg: DataConfig, folder: Path, clips: Sequence[tuple[str, str]
         clips: (id, split) of each clip.
         replay: makes pictures, None for none.
     """
-    result = PartResult([], [], [], 0, 0.0, 0)
+    result = PartResult(len(clips), [], [], [], [], 0, 0.0, 0)
     without = frames = 0
     seconds = 0.0
     for name, split in clips:
@@ -114,11 +116,12 @@ def part_of_clips(cfg: DataConfig, folder: Path, clips: Sequence[tuple[str, str]
         except DatasetError as error:
             result.dropped.append((name, "", str(error)))
             continue
-        kept = apply_phc_list(human) if cfg.phc_list else human
-        reason = kept if isinstance(kept, str) else automatic_rule(kept)
-        if reason or isinstance(kept, str):
-            result.dropped.append((name, "", str(reason)))
+        kept = admit(human, cfg.phc_list)
+        if isinstance(kept, str):
+            result.dropped.append((name, "", kept))
             continue
+        if len(kept.joints) < len(human.joints):
+            result.truncated.append(name)
         for robot in cfg.robots:
             retargeter = _retargeter(robot, cfg.iterations)
             start = time.perf_counter()
@@ -233,7 +236,9 @@ def _notes(result: PartResult) -> dict[str, Any]:
     for mean in means.values():
         mean["balance_cm"] = mean["balance_cm"] if np.isfinite(mean["balance_cm"]) else None
     return {
+        "clips": result.clips,
         "rows": len(result.rows),
+        "truncated": result.truncated,
         "dropped": [list(entry) for entry in result.dropped],
         "without_pictures": result.without_pictures,
         "retarget_s": round(result.retarget_s, 3),
@@ -249,7 +254,7 @@ def _metrics(row: dict[str, Any]) -> Metrics:
 
 def _summary(notes: dict[str, Any]) -> dict[str, Any]:
     parts = list(notes.values())
-    reasons = Counter(reason.split(" over ")[0].rsplit(" ", 1)[0] for part in parts for _, _, reason in part["dropped"])
+    reasons = Counter(reason_group(robot, reason) for part in parts for _, robot, reason in part["dropped"])
     metrics: dict[str, Any] = {}
     for robot in sorted({robot for part in parts for robot in part["metrics"]}):
         rows = [part["metrics"][robot] for part in parts if robot in part["metrics"]]

@@ -23,6 +23,7 @@ class GateConfig:
         float_pct: frames in contact with both soles more than 2 cm up.
         saturation_pct: joint-frames at a limit.
         velocity_pct: frames with a joint faster than its limit.
+        self_pct: frames in which parts that are no neighbours overlap by more than 1 cm.
         low_pelvis: share of the standing pelvis height that counts as low.
         low_pelvis_s: longest time in which the pelvis may be low.
     """
@@ -36,6 +37,7 @@ class GateConfig:
     float_pct: float = 10.0
     saturation_pct: float = 25.0
     velocity_pct: float = 1.0
+    self_pct: float = 10.0
     low_pelvis: float = 0.5
     low_pelvis_s: float = 0.5
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from configs.schema.data import GateConfig
-from data.filter import apply_phc_list, automatic_rule, gate, phc_list
+from data.filter import admit, apply_phc_list, automatic_rule, gate, phc_list
 from data.generator import generate_clip
 from data.metrics import (
     Metrics,
@@ -131,6 +131,8 @@ def test_gates(retargeters: dict[str, Retargeter], results: dict[tuple[str, int]
     assert gate(metrics, high, 1.03, 20.0, GateConfig()) == ""
     assert gate(dataclasses.replace(metrics, skate_cm_s=20.0), high, 1.03, 20.0, GateConfig()) == "skate_cm_s 20.00 over 8"
     assert gate(dataclasses.replace(metrics, foot_cm=float("nan")), high, 1.03, 20.0, GateConfig()).startswith("foot_cm")
+    assert gate(dataclasses.replace(metrics, self_pct=10.0), high, 1.03, 20.0, GateConfig()) == ""
+    assert gate(dataclasses.replace(metrics, self_pct=12.0), high, 1.03, 20.0, GateConfig()) == "self_pct 12.00 over 10"
     low = high.copy()
     low[5:25] = 0.3
     assert gate(metrics, low, 1.03, 20.0, GateConfig()) == "pelvis below 0.5 of standing for 1.0 s"
@@ -163,6 +165,14 @@ def test_automatic_rule() -> None:
     flying = clip.joints.copy()
     flying[1:] += [0, 0, 0.4]
     assert "both feet above" in automatic_rule(HumanMotion("a", flying, 20.0))
+
+
+def test_admission() -> None:
+    clip = dataclasses.replace(generate_clip(0, 6), name="000013")
+    assert admit(clip, use_list=False) is clip
+    assert admit(clip, use_list=True) == "PHC list: airborne"
+    lifted = dataclasses.replace(clip, joints=clip.joints + np.array([0.0, 0.0, 0.2]))
+    assert str(admit(lifted, use_list=False)).startswith("starts 0.2")
 
 
 def test_report_usage(capsys: pytest.CaptureFixture[str]) -> None:
