@@ -1,6 +1,6 @@
 """Table of what the filters dropped: `python -m data.filter table FOLDER`.
 
-Of a folder of `clips` shards it counts what the manifest records, from the clips in the list to the clips kept for each robot. Of
+Of a folder of `clips` shards it counts what the manifest records, from the clips in the list to those kept for each robot. Of
 a folder in HumanML3D's format, which needs no processing, it counts what PHC's list decides about its ids.
 
 Paper: data preparation, "filtered with PHC": 11k of HumanML3D's 14,616 clips are left.
