@@ -17,6 +17,7 @@ from data.metrics import (
 from data.motion import N_FEATURES, decode_key_bodies, heading_to_world
 from data.omomo import find_demo_clips, load_mocap, load_omomo
 from data.retarget import MAX_JOINT_VELOCITY, Retargeted, Retargeter
+from data.retarget_report import PHYSICS, measure, table
 from data.retarget_report import main as report
 from data.skeleton import Caption, HumanMotion
 from sim.robots.spec import load_robot
@@ -178,8 +179,22 @@ def test_admission() -> None:
 def test_report_usage(capsys: pytest.CaptureFixture[str]) -> None:
     assert report(["table"]) == 2
     assert "usage" in capsys.readouterr().err
+    assert report(["--physics"]) == 2
+    assert "[--physics]" in capsys.readouterr().err
     assert report(["report", "1"]) == 0
-    assert "skate_cm_s" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "skate_cm_s" in out and "physics" not in out
+
+
+def test_report_columns(retargeters: dict[str, Retargeter]) -> None:
+    clip = generate_clip(0, 6)
+    part = dataclasses.replace(clip, joints=clip.joints[:12], hand_opening=None)
+    plain, simulated = (measure("x1", retargeters["x1"], [part], physics) for physics in (False, True))
+    assert plain.physics is None and plain.metrics == simulated.metrics
+    assert simulated.physics is not None and simulated.physics.joint_deg < 4.0
+    labels = list(table([plain, simulated]).columns[0].cells)
+    assert labels[-5:] == [f"physics: {name}" for name in PHYSICS]
+    assert list(table([plain]).columns[0].cells)[-1] == "frames"
 
 
 @pytest.mark.motions
