@@ -26,6 +26,7 @@ __all__ = ["main", "stage", "strip"]
 
 mpl.use("Agg")
 _SIZE = 240
+_EXTENT_M = 2.5
 
 
 def _human(joints: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -58,6 +59,8 @@ def stage(mjcf: Path | None = None, chequered: bool = False) -> mujoco.MjModel:
         textures = [""] * int(mujoco.mjtTextureRole.mjNTEXROLE)
         textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = "squares"
         spec.add_material(name="squares", textures=textures, texrepeat=[1.0, 1.0], texuniform=True)
+        stat: Any = spec.stat
+        stat.extent = _EXTENT_M  # the same haze at the horizon for every figure
         floor.material, floor.size, floor.rgba = "squares", [0.0, 0.0, 0.1], [1.0, 1.0, 1.0, 1.0]
     spec.add_texture(
         name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
