@@ -220,6 +220,12 @@ def column(method: str, retargeter: Retargeter, clips: Sequence[HumanMotion], re
     return Column(method, mean, float(np.average(world, weights=frames)), float(processor), float(wall), metrics)
 
 
+def record(found: Column) -> dict[str, Any]:
+    """Numbers for JSON, which has no nan."""
+    known = lambda values: {name: None if math.isnan(value) else value for name, value in values.items()}  # noqa: E731
+    return known(found.values()) | {"clips": {name: known(dataclasses.asdict(m)) for name, m in found.clips.items()}}
+
+
 def table(columns: Sequence[Column]) -> str:
     lines = [f"| metric | {' | '.join(c.method for c in columns)} |", f"|---|{'---:|' * len(columns)}"]
     for name in columns[0].values():
@@ -290,24 +296,19 @@ def main() -> None:
         title = f"{robot}, {f'first {arguments.frames} frames' if clips is short else 'whole clips'}"
         said = judge(columns)
         print(f"\n## {title}\n\n{table(columns)}\n", *(f"* {line}" for line in said), sep="\n", flush=True)
-        tables[title] = {
-            "verdict": said,
-            "methods": {
-                c.method: c.values() | {"clips": {name: dataclasses.asdict(m) for name, m in c.clips.items()}} for c in columns
-            },
-        }
-    if arguments.out:
-        rows = {
-            "command": " ".join(sys.argv),
-            "seed": arguments.seed,
-            "generator_version": GENERATOR_VERSION,
-            "clips": {clip.name: {"frames": len(clip.joints), "height_m": height_m(clip.joints)} for clip in whole},
-            "repeats": arguments.repeats,
-            "versions": versions,
-            "tables": tables,
-        }
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        tables[title] = {"verdict": said, "methods": {c.method: record(c) for c in columns}}
+        if arguments.out:  # after each table, since the first one takes minutes
+            rows = {
+                "command": " ".join(sys.argv),
+                "seed": arguments.seed,
+                "generator_version": GENERATOR_VERSION,
+                "clips": {clip.name: {"frames": len(clip.joints), "height_m": height_m(clip.joints)} for clip in whole},
+                "repeats": arguments.repeats,
+                "versions": versions,
+                "tables": tables,
+            }
+            arguments.out.parent.mkdir(parents=True, exist_ok=True)
+            arguments.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
