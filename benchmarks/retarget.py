@@ -226,13 +226,15 @@ def record(found: Column) -> dict[str, Any]:
     return known(found.values()) | {"clips": {name: known(dataclasses.asdict(m)) for name, m in found.clips.items()}}
 
 
+def digits(value: float) -> str:
+    """Three digits, a dash for nan."""
+    return "-" if math.isnan(value) else f"{value:.3g}" if abs(value) < 100.0 else f"{value:.0f}"
+
+
 def table(columns: Sequence[Column]) -> str:
     lines = [f"| metric | {' | '.join(c.method for c in columns)} |", f"|---|{'---:|' * len(columns)}"]
     for name in columns[0].values():
-        cells = (c.values()[name] for c in columns)
-        lines.append(
-            f"| {name} | {' | '.join('-' if math.isnan(v) else f'{v:.3g}' if abs(v) < 100 else f'{v:.0f}' for v in cells)} |"
-        )
+        lines.append(f"| {name} | {' | '.join(digits(c.values()[name]) for c in columns)} |")
     return "\n".join(lines)
 
 
@@ -243,17 +245,16 @@ def judge(columns: Sequence[Column]) -> list[str]:
     for other in columns[1:]:
         theirs = other.values()
         ratio, aim = theirs["ms"] / ours["ms"], AIMS[other.method]
-        said.append(f"{'met' if ratio >= aim else 'NOT MET'}: {ratio:.1f} times faster than {other.method}, aim {aim:.0f}")
+        said.append(f"{'met' if ratio >= aim else 'NOT MET'}: {digits(ratio)} times faster than {other.method}, aim {aim:.0f}")
         for name in AT_LEAST_EQUAL:
             met = "met" if ours[name] <= theirs[name] else "NOT MET"
-            said.append(f"{met}: {name} {ours[name]:.2f}, {other.method} {theirs[name]:.2f}")
-        better = [
-            f"{name} {theirs[name]:.2f} (ours {ours[name]:.2f})"
-            for name in ours
-            if name not in (*NO_QUALITY, "ms", "wall_ms", "hand_world_cm")
-            and (theirs[name] - ours[name]) * (-1.0 if name in HIGHER_IS_BETTER else 1.0) < 0.0
-        ]
-        said.append(f"{other.method} is better in: {', '.join(better) or 'nothing that is measured here'}")
+            said.append(f"{met}: {name} {digits(ours[name])}, {other.method} {digits(theirs[name])}")
+        better = []
+        for name in ours.keys() - {*NO_QUALITY, "ms", "wall_ms", "hand_world_cm"}:
+            sign = -1.0 if name in HIGHER_IS_BETTER else 1.0
+            if sign * theirs[name] < sign * ours[name] and digits(theirs[name]) != digits(ours[name]):
+                better.append(f"{name} {digits(theirs[name])} (ours {digits(ours[name])})")
+        said.append(f"{other.method} is better in: {', '.join(sorted(better)) or 'nothing that is measured here'}")
     return said
 
 
