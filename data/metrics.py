@@ -20,13 +20,15 @@ from data.contacts import toe_contacts
 from data.motion import FPS
 from data.retarget import MAX_JOINT_VELOCITY, Retargeted, Retargeter
 from data.self_contact import DEEP_M
-from data.skeleton import index
+from data.skeleton import HumanMotion, index
+from data.targets import Targets
 
 __all__ = [
     "Metrics",
     "angle_deg",
     "balance_cm",
     "evaluate",
+    "evaluate_joints",
     "jerk_rad_s3",
     "limit_violation_pct",
     "pa_mpjpe_cm",
@@ -161,45 +163,68 @@ def jerk_rad_s3(q: Array, fps: float) -> float:
     return float(np.abs(np.diff(q, 3, axis=0)).mean() * fps**3) if len(q) > 3 else 0.0
 
 
-def balance_cm(retargeter: Retargeter, result: Retargeted, soles: Array) -> float:
+def balance_cm(retargeter: Retargeter, root_pose: Array, q: Array, contact: Mask) -> float:
     """Mean signed distance (cm) of the centre of mass to the support polygon's edge, over slow double support.
 
     Args:
         retargeter: of the robot.
-        result: retargeted clip.
-        soles: (T, 2, 3) metres.
+        root_pose: (T, 7) metres and quaternion (w, x, y, z).
+        q: (T, J) joints.
+        contact: (T, 2) planted feet.
 
     Returns:
         Positive inside; nan without such frames.
     """
-    motion = result.motion
-    assert motion.root_pose is not None
-    assert motion.joint_positions is not None
-    slow = np.zeros(len(soles), dtype=bool)
-    slow[1:] = np.linalg.norm(np.diff(motion.root_pose[:, :2], axis=0), axis=1) * FPS < 0.1
-    both = result.targets.contact.all(axis=1) & slow
-    frames = np.flatnonzero(both)[::4]
-    margins = [retargeter.robot.balance_margin(motion.root_pose[t], motion.joint_positions[t]) for t in frames]
+    slow = np.zeros(len(q), dtype=bool)
+    slow[1:] = np.linalg.norm(np.diff(root_pose[:, :2], axis=0), axis=1) * FPS < 0.1
+    frames = np.flatnonzero(contact.all(axis=1) & slow)[::4]
+    margins = [retargeter.robot.balance_margin(root_pose[t], q[t]) for t in frames]
     return float(100.0 * np.mean(margins)) if margins else float("nan")
 
 
 def evaluate(retargeter: Retargeter, result: Retargeted) -> Metrics:
     """Metrics of one retargeted clip."""
-    motion, targets, human = result.motion, result.targets, result.source.joints
+    motion = result.motion
     assert motion.root_pose is not None
     assert motion.joint_positions is not None
-    robot, spec, root, q = retargeter.robot, retargeter.spec, motion.root_pose, motion.joint_positions
-    places = retargeter.measured_points(result)
+    targets = result.targets
+    return evaluate_joints(retargeter, motion.root_pose, motion.joint_positions, result.source, targets.contact, targets)
+
+
+def evaluate_joints(
+    retargeter: Retargeter, root: Array, q: Array, source: HumanMotion, contact: Mask, targets: Targets | None = None
+) -> Metrics:
+    """Metrics of a motion of the robot, whichever method made it.
+
+    Args:
+        retargeter: of the robot.
+        root: (T, 7) position (m) and quaternion (w, x, y, z) of the pelvis at 20 frames per second.
+        q: (T, J) joints, in the order of `RobotModel.joint_names`.
+        source: the human motion that it follows, in the same world and frame by frame.
+        contact: (T, 2) planted feet of the human.
+        targets: what the method aimed at; None when those are not known, which leaves hand and foot errors nan.
+
+    Raises:
+        ValueError: when the lengths differ.
+    """
+    human = source.joints
+    if not len(root) == len(q) == len(contact) == len(human):
+        lengths = f"{len(root)}, {len(q)}, {len(contact)} and {len(human)}"
+        raise ValueError(f"root poses, joints, contacts and human have {lengths} frames; they must be as many")
+    robot, spec = retargeter.robot, retargeter.spec
+    places = retargeter.measured_joints(root, q)
     soles, corners = places.soles, places.sole_corners
-    foot = np.linalg.norm(soles - targets.soles, axis=-1) * 100.0
-    hand = np.linalg.norm(places.arms.sum(axis=2) - targets.arms.sum(axis=2), axis=-1) * 100.0
+    hand = foot = np.array([np.nan])
+    if targets is not None:
+        foot = np.linalg.norm(soles - targets.soles, axis=-1) * 100.0
+        hand = np.linalg.norm(places.arms.sum(axis=2) - targets.arms.sum(axis=2), axis=-1) * 100.0
     side = lambda name: human[:, [index(f"left_{name}"), index(f"right_{name}")]]  # noqa: E731
     arm = [angle_deg(places.arms[:, :, k], side(b) - side(a)) for k, (a, b) in enumerate(_ARM_BONES)]
     leg = [angle_deg(places.legs[:, :, k], side(b) - side(a)) for k, (a, b) in enumerate(_LEG_BONES)]
     lowest = corners[..., 2].reshape(len(q), -1).min(axis=1)
     depth = np.maximum(-lowest, 0.0) * 100.0
     overlap = np.array([retargeter.self_contact.depth_m(pose, joints) for pose, joints in zip(root, q, strict=True)])
-    touching = targets.contact.any(axis=1)
+    touching = contact.any(axis=1)
     moves = np.abs(np.diff(q, axis=0))
     body = robot.indices((*spec.leg_joints, *spec.waist_joints, *(j for a in spec.arms.values() for j in a.joints)))
     lower, upper = robot.lower[body], robot.upper[body]
@@ -210,9 +235,9 @@ def evaluate(retargeter: Retargeter, result: Retargeted) -> Metrics:
         foot_p95_cm=float(np.quantile(foot, 0.95)),
         arm_deg=float(np.mean(arm)),
         leg_deg=float(np.mean(leg)),
-        skate_cm_s=skate_cm_s(soles, targets.contact, FPS),
+        skate_cm_s=skate_cm_s(soles, contact, FPS),
         human_skate_cm_s=skate_cm_s(
-            human[:, [index("left_foot"), index("right_foot")]], toe_contacts(human, result.source.fps), result.source.fps
+            human[:, [index("left_foot"), index("right_foot")]], toe_contacts(human, source.fps), source.fps
         ),
         penetration_cm=float(depth.mean()),
         penetration_max_cm=float(depth.max()),
@@ -226,7 +251,7 @@ def evaluate(retargeter: Retargeter, result: Retargeted) -> Metrics:
         self_pct=float(100.0 * np.mean(overlap > DEEP_M)),
         self_max_cm=float(100.0 * overlap.max()),
         pa_mpjpe_cm=pa_mpjpe_cm(places.points, np.concatenate([side(name) for name in _POINTS], axis=1)),
-        balance_cm=balance_cm(retargeter, result, soles),
+        balance_cm=balance_cm(retargeter, root, q, contact),
         lowest_pelvis=float(root[:, 2].min() / spec.standing_pelvis_height_m),
         frames=len(q),
     )

@@ -199,7 +199,11 @@ class Retargeter:
         motion = result.motion
         assert motion.root_pose is not None
         assert motion.joint_positions is not None
-        frames = len(motion.root_pose)
+        return self.measured_joints(motion.root_pose, motion.joint_positions)
+
+    def measured_joints(self, root_pose: Array, joints: Array) -> Measured:
+        """Points of the robot for root poses (T, 7) and joint vectors (T, J)."""
+        frames = len(root_pose)
         soles, corners = np.empty((frames, 2, 3)), np.empty((frames, 2, 4, 3))
         chains = np.empty((frames, 2, 2, 3, 3))  # side, leg or arm, along the limb
         model, data = self.robot.model, self.robot.data
@@ -208,7 +212,7 @@ class Retargeter:
             [self.robot.frame_id(keys[f"{side}_{part}"]) for part in ("hip", "knee", "ankle")] for side in ("left", "right")
         ]
         for t in range(frames):
-            pin.framesForwardKinematics(model, data, self.robot.configuration(motion.root_pose[t], motion.joint_positions[t]))
+            pin.framesForwardKinematics(model, data, self.robot.configuration(root_pose[t], joints[t]))
             for side in (0, 1):
                 sole = data.oMf[self._soles[side]]
                 soles[t, side] = sole.translation

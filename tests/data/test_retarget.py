@@ -10,6 +10,7 @@ from data.metrics import (
     Metrics,
     angle_deg,
     evaluate,
+    evaluate_joints,
     limit_violation_pct,
     saturation_pct,
     skate_cm_s,
@@ -112,6 +113,22 @@ def test_limits_and_saturation() -> None:
     q = np.array([[0.0, 1.2], [0.995, 0.0]])
     assert limit_violation_pct(q, lower, upper) == 25.0
     assert saturation_pct(q, lower, upper) == 50.0
+
+
+def test_metrics_of_joints_without_targets(
+    retargeters: dict[str, Retargeter], results: dict[tuple[str, int], Retargeted]
+) -> None:
+    result = results["h1", 16]
+    root, q = result.motion.root_pose, result.motion.joint_positions
+    assert root is not None
+    assert q is not None
+    metrics = evaluate_joints(retargeters["h1"], root, q, result.source, result.targets.contact)
+    errors = ("hand_cm", "hand_p95_cm", "foot_cm", "foot_p95_cm")
+    assert np.isnan([getattr(metrics, name) for name in errors]).all()
+    known = evaluate(retargeters["h1"], result)
+    assert dataclasses.replace(metrics, **{name: getattr(known, name) for name in errors}) == known
+    with pytest.raises(ValueError, match=f"{len(root) - 1}, {len(q)}, "):
+        evaluate_joints(retargeters["h1"], root[1:], q, result.source, result.targets.contact)
 
 
 def test_mean_metrics(retargeters: dict[str, Retargeter], results: dict[tuple[str, int], Retargeted]) -> None:
