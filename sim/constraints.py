@@ -1,9 +1,9 @@
 """Grasp constraints: what makes an object follow the hand once contact has justified it.
 
 Every arm has one weld (objects) and one ball joint (handles of doors and drawers). They are pointed at a body at run time by
-writing `eq_obj2id` and `eq_data`, which MuJoCo reads at every step. A held body no longer touches the hands, which keeps the
-contact count and the internal forces small; after release it touches them again as soon as nothing overlaps. Paper: grasps of
-DualTHOR, which need no contact there.
+writing `eq_obj2id` and `eq_data`, which MuJoCo reads at every step. A held body no longer touches the hands (a door: the hand
+that holds it), which keeps the contact count and the internal forces small; after release it touches them again as soon as
+nothing overlaps. Paper: grasps of DualTHOR, which need no contact there.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.scene import HELD_BITS, HELD_DOOR_BITS, MOVABLE_BITS, STATIC_BITS
+from sim.scene import ARM_BITS, HELD_BITS, HELD_DOOR_BITS, LIMB_BIT, MOVABLE_BITS, STATIC_BITS
 
 __all__ = ["GraspConstraints"]
 
@@ -50,6 +50,9 @@ class GraspConstraints:
             bodies = [body for body in range(model.nbody) if self._below(body, hand)]
             inside = np.isin(model.geom_bodyid, bodies) & (model.geom_contype != 0)
             self._hand_geoms[arm] = np.flatnonzero(inside)
+            chain = [body for body in range(model.nbody) if self._below(hand, body)]
+            limb = inside | (np.isin(model.geom_bodyid, chain) & (model.geom_contype == LIMB_BIT))
+            model.geom_contype[limb] |= ARM_BITS[arm]
 
     def _below(self, body: int, ancestor: int) -> bool:
         while body > 0:
@@ -114,12 +117,13 @@ class GraspConstraints:
         model.eq_data[eq] = values
         model.eq_solref[eq, 0] = _GENTLE_S if gentle else _FIRM_S
         data.eq_active[eq] = 1
+        others = sum(bit for other, bit in ARM_BITS.items() if other != arm)
         for moved in (body, *lids):
-            self._set_bits(moved, HELD_BITS if rigid else HELD_DOOR_BITS)
+            self._set_bits(moved, HELD_BITS if rigid else (HELD_DOOR_BITS[0], others))
         self.released = [pair for pair in self.released if pair[1] not in (body, *lids)]
 
     def give_way(self, lid: int, below: int | None) -> None:
-        """Ends the contacts of a lid, and of the free body below it, with the hands, as when they are held."""
+        """Ends the contacts of a lid, and of the free body below it, with both hands."""
         self._set_bits(lid, HELD_DOOR_BITS)
         if below is not None:
             self._set_bits(below, HELD_BITS)

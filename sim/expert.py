@@ -10,7 +10,7 @@ state gets the same step. It is marked privileged in every table; learned planne
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -37,12 +37,19 @@ _REHEARSED: Final = 4
 _PATIENCE: Final = 5
 #: Changes of height that are tried at one stance before another stance is.
 _HEIGHT_TRIALS: Final = 2
+#: Ways of doing one thing after the other that are acted out in thought before the expert gives up.
+_ACTED_OUT: Final = 12
 #: Height above a surface at which a load is carried towards it.
 _OVER_EDGE_M: Final = 0.04
+#: Step back from what a walk ran into, and how often that helps.
+_BACK_M: Final = 0.2
+_RETREATS: Final = 2
 #: Looks around for an object that should be near, before giving up.
 _LOOKS: Final = 6
 #: Objects lower than this lie on the floor, out of reach.
 _FLOOR_M: Final = 0.35
+#: Targets that are farther apart than this are not for both arms at once.
+_TOGETHER_M: Final = 0.9
 #: Farther away than this, an arm need not be asked.
 _FAR_M: Final = 1.1
 #: Names of actions that change the stance or the height.
@@ -93,16 +100,18 @@ class _Memory:
         refusals: what does not work from where.
         gone: stances tried, by target.
         rehearsed: stances tried in thought.
+        barren: what was tried in thought from where, in vain.
     """
 
     attempts: dict[str, int] = field(default_factory=dict)
     refusals: list[_Refusal] = field(default_factory=list)
     gone: dict[str, set[str]] = field(default_factory=dict)
     rehearsed: int = 0
+    barren: list[tuple[str, _Place]] = field(default_factory=list)
 
     def copy(self) -> _Memory:
         gone = {target: set(tried) for target, tried in self.gone.items()}
-        return _Memory(dict(self.attempts), list(self.refusals), gone, self.rehearsed)
+        return _Memory(dict(self.attempts), list(self.refusals), gone, self.rehearsed, list(self.barren))
 
 
 class Expert:
@@ -115,15 +124,17 @@ class Expert:
 
     privileged: Final = True
 
-    def __init__(self, session: Session, rehearsals: int | None = None) -> None:
+    def __init__(self, session: Session, rehearsals: int | None = None, arms: Sequence[Arm] = (Arm.RIGHT, Arm.LEFT)) -> None:
         """Attaches to a session.
 
         Args:
             session: the robot in its world.
             rehearsals: stances it may try in thought in an episode before it gives up; no limit when None.
+            arms: the arms it uses; with one of them it shows what a one-armed robot could do.
         """
         self._session = session
         self._rehearsals = rehearsals
+        self._usable = tuple(arms)
         self._memory, self._before = _Memory(), _Memory()
         self._homes: dict[str, str] = {}
         self._proposed = ""
@@ -145,8 +156,21 @@ class Expert:
             name for name, thing in session.world.objects.items() if thing.movable and session.world.needs_two_hands(name)
         )
         held = {arm: None if item == lifted else item for arm, item in session.body.held.items()}
-        uncovered = frozenset(name for name, thing in session.world.objects.items() if not thing.type.encloses)
-        return Facts(objects, held, lifted, two_handed, self._homes, uncovered)
+        things = session.world.objects
+        links = session.world.room.links
+        return Facts(
+            objects,
+            held,
+            lifted,
+            two_handed,
+            self._homes,
+            uncovered=frozenset(name for name, thing in things.items() if not thing.type.encloses),
+            tools={use: tuple(n for n, thing in things.items() if thing.type.has(use)) for use in ("cutter", "wiper")},
+            unsteady=frozenset(name for name, thing in things.items() if thing.type.has("unsteady")),
+            outlets=tuple(n for n in (*links, *things) if things[n].type.name in ("Faucet", "CoffeeMachine")),
+            switches={furniture: switch for switch, furniture in links.items()},
+            arms=self._usable,
+        )
 
     def step(self, observation: object = None, feedback: object = None) -> PlanStep:
         """The planner interface; what it is shown does not matter to it."""
@@ -168,22 +192,36 @@ class Expert:
             return _single(Action("Done"))
         self._learn()
         head = jobs[0]
+        if not head.target:
+            return _single(head.action(head.arm))
+        if self._takes_unusable(head):
+            return _single(Action("Done"))
         if head.target not in self._session.known_objects:
             return _single(self._find(head.target, facts))
-        self.intent = head.action(self._arms(head, facts)[0])
+        arms = self._arms(head, facts)
+        if not arms:  # the hands are full of what has to stay in them
+            return _single(Action("Done"))
+        self.intent = head.action(arms[0])
         verdicts: list[SkillFailure] = []
-        for arm in self._arms(head, facts):
+        for arm in arms:
             action = head.action(arm)
             refusal = self._refused_here(action)
             if refusal is None:
                 verdict = self._session.assess(action)
-                if verdict is None:
+                if verdict is None and self._leads_on(head, arm, facts):
                     return self._with_companion(head, arm, jobs[1:], facts)
                 refusal = _Refusal(action.to_text(), self._here(), verdict)
                 self._memory.refusals.append(refusal)
             if refusal.verdict is not None:
                 verdicts.append(refusal.verdict)
-        return _single(self._approach(head, verdicts, facts))
+        together = self._approach_together(head, jobs[1:], facts)
+        return _single(together or self._approach(head, verdicts, facts))
+
+    def _takes_unusable(self, job: Job) -> bool:
+        """Whether a job takes an arm that is disabled."""
+        if job.arm is not None:
+            return job.arm not in self._usable
+        return job.verb in ("Lift", "PlaceBoth") and len(self._usable) < 2
 
     # ---- memory
 
@@ -221,6 +259,8 @@ class Expert:
 
     def _lost(self, job: Job, facts: Facts) -> bool:
         """Whether the job's object lies on the floor, where neither robot reaches, or is broken."""
+        if not job.target:
+            return False
         entry = facts.objects[job.target]
         if not self._session.world.objects[job.target].movable or entry["isPickedUp"]:
             return False
@@ -241,10 +281,12 @@ class Expert:
 
     def _with_companion(self, head: Job, arm: Arm | None, others: Sequence[Job], facts: Facts) -> PlanStep:
         """The step for `head`, with a job for the other arm beside it where that is possible right now."""
-        if arm is None:
-            return _single(head.action(None))
+        if arm is None or head.then is not None:
+            return _single(head.action(arm))
         for job in others:
-            if job.verb in ("Lift", "PlaceBoth") or job.target not in self._session.known_objects or self._is_far(job.target):
+            if job.verb in ("Lift", "PlaceBoth") or job.then is not None or not job.target:
+                continue
+            if job.target not in self._session.known_objects or self._is_far(job.target):
                 continue
             pairs = [(arm, arm.other)]
             if head.arm is None and job.arm is None and len(facts.free_arms()) == 2:
@@ -269,8 +311,100 @@ class Expert:
 
     # ---- the body
 
+    def _follow_up(self, job: Job, arm: Arm | None, facts: Facts) -> Action | None:
+        """What the other arm does after a job that makes it possible, None when nothing has to follow."""
+        if job.then is None or arm is None:
+            return None
+        return job.then.action(job.then.arm or arm.other)
+
+    def _leads_on(self, job: Job, arm: Arm | None, facts: Facts) -> bool:
+        """Whether what has to follow a job can be done from here as well."""
+        following = self._follow_up(job, arm, facts)
+        if following is None:
+            return True
+        return following.arm in self._usable and self._rehearsal.leads_to(job.action(arm), following)
+
+    def _approach_for_two(self, job: Job, facts: Facts) -> Action:
+        """The body action towards a place from where one arm can do a job and the other what follows it."""
+        pairs = [(job.action(arm), self._follow_up(job, arm, facts)) for arm in self._arms(job, facts)]
+        pairs = [(first, then) for first, then in pairs if then is not None and then.arm in self._usable]
+        if not pairs or self._count(f"stance {job.target}") >= _PATIENCE:
+            return Action("Done")
+        present, *heights = self._rehearsal.heights_m()
+        tried = self._memory.gone.setdefault(job.target, set())
+        trials = 0
+        for option, stance in self._stances_for_two(job.target, tried):
+            for height in (present, *heights) if option is not None else heights:
+                for first, then in pairs:
+                    if not self._rehearsal.might_lead_to(first, then, stance, height):
+                        continue
+                    trials += 1
+                    if self._rehearsal.leads_to(first, then, stance, height):
+                        tried.add("" if option is None else option.to_text())
+                        return self._height_change(height - present) if option is None else option
+                    if trials >= _ACTED_OUT:
+                        return Action("Done")
+        return Action("Done")
+
+    def _stances_for_two(self, target: str, tried: Collection[str]) -> Iterator[tuple[Action | None, Stance]]:
+        """Where two arms might work on a target: here, without an action, then where walks would end."""
+        yield None, self._session.body.commanded_base()
+        for distance, bearing in _STANCES:
+            option = Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
+            stance = None if option.to_text() in tried else self._rehearsal.stance_of(option)
+            if stance is not None:
+                yield option, stance
+
+    def _approach_together(self, head: Job, others: Sequence[Job], facts: Facts) -> Action | None:
+        """A walk to where both arms can work at once, None when there is nothing for the other arm or no such place.
+
+        It is thought about once for every pair of targets.
+        """
+        partner = next((job for job in others if self._goes_with(head, job)), None)
+        if partner is None or head.then is not None or self._count(f"together {head.target} {partner.target}"):
+            return None
+        pairs = [
+            (head.action(arm), partner.action(arm.other))
+            for arm in self._usable
+            if head.arm in (None, arm) and partner.arm in (None, arm.other) and arm.other in self._usable
+        ]
+        for target in dict.fromkeys((head.target, partner.target)):
+            for distance, bearing in _STANCES[:3]:
+                option = Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
+                stance = self._rehearsal.stance_of(option)
+                if stance is not None and self._rehearsal.works_together(pairs, stance):
+                    return option
+        return None
+
+    def _stuck(self) -> bool:
+        """Whether the last walk ended at an obstacle and there is room to step back from it."""
+        history, body = self._session.history, self._session.body
+        if not history or not history[-1].feedback.endswith(FailureCode.BLOCKED_PATH.value):
+            return False
+        base = body.commanded_base()
+        behind = base.position - _BACK_M * np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
+        return not history[-1].step.startswith("Move") and body.navigation().free_travel(base.position, behind) > 0.9 * _BACK_M
+
+    def _goes_with(self, head: Job, other: Job) -> bool:
+        """Whether two jobs might be done at once, by one arm each."""
+        arm_jobs = head.arm is None or other.arm is None or head.arm is not other.arm
+        if not other.target or other.then is not None or not arm_jobs or {head.verb, other.verb} & {"Lift", "PlaceBoth"}:
+            return False
+        if other.target not in self._session.known_objects:
+            return False
+        body = self._session.body
+        gap = body.interaction_point(head.target)[:2] - body.interaction_point(other.target)[:2]
+        return len(self._usable) == 2 and float(np.hypot(*gap)) < _TOGETHER_M
+
     def _approach(self, job: Job, verdicts: Sequence[SkillFailure], facts: Facts) -> Action:
         """The body action that brings a known target into reach."""
+        at_door = next((arm for arm, item in facts.held.items() if item is not None and facts.in_place(item)), None)
+        if at_door is not None:  # a hand that holds something where it is keeps the robot there
+            return Action("Release", arm=at_door)
+        if self._stuck() and self._count("back off") < _RETREATS:
+            return Action("MoveBack", amount=_BACK_M)
+        if job.then is not None:
+            return self._approach_for_two(job, facts)
         target = job.target
         wrong = next((verdict for verdict in verdicts if verdict.code in _WRONG_HEIGHT), None)
         if wrong is not None and self._count(f"height {target}") < _HEIGHT_TRIALS:
@@ -286,14 +420,24 @@ class Expert:
         options = [Action("GoTo", object_id=target, amount=d, bearing_deg=b) for d, b in _STANCES]
         tried = self._memory.gone.setdefault(target, set())
         fresh = [option for option in options if option.to_text() not in tried]
-        for option in fresh[:_REHEARSED]:
+        looked, what = 0, " or ".join(action.to_text() for action in actions)
+        for option in fresh:
+            if looked == _REHEARSED:
+                break
             if self._rehearsals is not None and self._memory.rehearsed >= self._rehearsals:
                 return Action("Done")
-            self._memory.rehearsed += 1
             stance = self._rehearsal.stance_of(option)
-            if stance is not None and self._rehearsal.works(actions, stance):
+            if stance is None:
+                continue
+            place = _Place(stance, self._session.body.pelvis_height_m)
+            if any(what == known and place.near(other) for known, other in self._memory.barren):
+                continue
+            looked += 1
+            self._memory.rehearsed += 1
+            if self._rehearsal.works(actions, stance):
                 tried.add(option.to_text())
                 return option
+            self._memory.barren.append((what, place))
         option = fresh[0] if fresh else options[0]
         tried.add(option.to_text())
         return option

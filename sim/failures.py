@@ -48,6 +48,7 @@ class FailureCode(StrEnum):
     NOT_DIRTY = "NotDirty"
     NOT_USABLE = "NotUsable"
     NOT_FILLABLE = "NotFillable"
+    NEEDS_STEADYING = "NeedsSteadying"
     NEEDS_TOOL = "NeedsTool"
     EMPTY = "Empty"
     SOURCE_OFF = "SourceOff"
@@ -117,6 +118,7 @@ FAILURES: Final[Mapping[FailureCode, FailureSpec]] = {
     FailureCode.NEEDS_TOOL: FailureSpec(
         _LOGIC, "the hand does not hold what the action takes: a knife, a sponge or towel, a vessel"
     ),
+    FailureCode.NEEDS_STEADYING: FailureSpec(_LOGIC, "the object would roll or slide away, Hold it with the other hand"),
     FailureCode.EMPTY: FailureSpec(_LOGIC, "there is nothing to pour in the vessel that the hand holds"),
     FailureCode.SOURCE_OFF: FailureSpec(_LOGIC, "nothing comes out of the source, switch it on"),
     FailureCode.ALREADY_IN_STATE: FailureSpec(_LOGIC, "the object already is in the state that the action makes"),

@@ -64,11 +64,11 @@ SCENES: Final[Mapping[str, Scene]] = {
     "toggle": Scene(("GoTo(StoveKnob_1)", "ToggleOn(left, StoveKnob_1)", "ToggleOff(left, StoveKnob_1)"), ()),
     "hold_release": Scene(("GoTo(Cup_1)", "Hold(right, Cup_1)", "Release(right)"), (_on("Cup_1", 1.5, -0.85),)),
     "slice": Scene(
-        ("GoTo(Knife_1)", "Pick(left, Knife_1)", "GoTo(Apple_1)", "Slice(left, Apple_1)"),
+        ("GoTo(Knife_1)", "Pick(left, Knife_1)", "GoTo(Apple_1)", "Hold(right, Apple_1)", "Slice(left, Apple_1)"),
         (_on("Knife_1", 1.5, -0.78), _on("Apple_1", 1.8, -0.8)),
     ),
     "clean": Scene(
-        ("GoTo(DishSponge_1)", "Pick(right, DishSponge_1)", "GoTo(Bowl_1)", "Clean(right, Bowl_1)"),
+        ("GoTo(DishSponge_1)", "Pick(right, DishSponge_1)", "GoTo(Bowl_1)", "Hold(left, Bowl_1)", "Clean(right, Bowl_1)"),
         (_on("DishSponge_1", 1.5, -0.76), _on("Bowl_1", 1.85, -0.8, isDirty=True)),
     ),
     "use_up": Scene(("GoTo(PaperTowelRoll_1)", "UseUp(right, PaperTowelRoll_1)"), (_on("PaperTowelRoll_1", 1.5, -0.88),)),

@@ -65,6 +65,7 @@ def object_metadata(world: World, thing: ObjectInstance, parents: tuple[str, ...
         "openable": kind.openable,
         "isOpen": thing.is_open if kind.openable else False,
         "openness": thing.openness,
+        "selfClosing": thing.self_closing,
         "pickupable": kind.pickupable,
         "isPickedUp": bool(thing.held_by),
         "heldBy": list(thing.held_by),

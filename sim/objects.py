@@ -54,7 +54,7 @@ class ObjectPlacement:
         receptacle: id of what carries it; placed before it.
         xy: world position (m), None for a free spot drawn from the world's seed.
         yaw_deg: orientation about z.
-        state: start state under AI2-THOR names, see `STATE_NAMES`; `mass` in kilograms is allowed too.
+        state: start state under AI2-THOR names, see `STATE_NAMES`; `mass` in kilograms and `selfClosing` are allowed too.
     """
 
     object_id: str
@@ -144,6 +144,8 @@ class ObjectInstance:
         local_min, local_max: bounding box of the resting shape in the body frame, metres.
         state: current state.
         held_by: arms that hold it, in the order of grasping.
+        openness: how far its door, drawer or lid is open, 0 to 1.
+        self_closing: whether a spring shuts its door or drawer as soon as nothing holds it open.
         mass_kg: mass without contents.
     """
 
@@ -164,6 +166,7 @@ class ObjectInstance:
     state: ObjectState = field(default_factory=ObjectState)
     held_by: list[str] = field(default_factory=list)
     openness: float = 0.0
+    self_closing: bool = False
 
     @property
     def is_open(self) -> bool:

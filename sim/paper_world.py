@@ -2,8 +2,8 @@
 
 What to do next follows mostly from the instruction, the log and the names. A pretrained language model reads that; a small one
 trained on a few thousand simulated steps does not learn what each refusal asks for. The world here holds facts only: who
-stands where, which hand holds what, which door is open, how low the body has to be. Tasks are drawn from the same families as
-everywhere (`sim.tasks.drafts`), the expert's own job planner (`sim.tasks.jobs`) names the next step, and part of the steps that
+stands where, which hand holds what, which door is open, how low the body has to be. Tasks are drawn from families of
+`sim.tasks.families`, the expert's own job planner (`sim.tasks.jobs`) names the next step, and part of the steps that
 are taken are mistakes, so that every refusal is followed by what mends it. Half of the rooms are made up. Steps that only eyes
 could justify (a turn towards something unseen, a change of height that nothing has called for yet) are taken, not recorded.
 
@@ -24,13 +24,22 @@ from configs.schema.collect import CollectConfig
 from data.records import Action, ActionKind, Arm, HistoryItem, PlanStep
 from sim.failures import FailureCode
 from sim.students import accepted
-from sim.tasks.drafts import FAMILIES, Draft, NoDraft, Scene, category_of, draw
+from sim.tasks.drafts import Draft, NoDraft, Scene
+from sim.tasks.families import CATEGORIES, FAMILIES, draw, family_of
 from sim.tasks.jobs import Facts, Job, plan_jobs
-from sim.tasks.sample import rng_for, scene_of, typical_steps
+from sim.tasks.sample import UNSEEN_TYPES, rng_for, scene_of
 
 __all__ = ["Exercise", "corrections_of_part", "exercises_of_part", "judgement", "judgements_of_part", "play", "play_alone"]
 
 #: Earlier steps that a row keeps.
+#: Families whose states the facts of this world know: no tools, liquids, heat, doors that fall shut, or any object of a type.
+_FAMILIES: Final = (
+    "pick", "place", "open", "close", "toggle_on", "toggle_off", "transport_two", "transport_each", "pick_and_toggle_on",
+    "pick_and_toggle_off", "pick_and_open", "fetch", "fetch_hold", "stow", "stow_close", "lift", "carry", "hold_two",
+    "carry_and_toggle", "carry_and_place",
+)  # fmt: skip
+#: Types with lids or switches of their own, which it does not know either.
+_LEFT_OUT: Final = (*UNSEEN_TYPES, "Laptop", "Book", "DeskLamp", "CellPhone")
 _HISTORY: Final = 8
 _MAX_STEPS: Final = 24
 _HEIGHT_STEP_M: Final = 0.05
@@ -155,7 +164,7 @@ class _Episode:
         self.world = _PaperWorld(draft, scene, self.rng)
         hidden = [thing for thing in draft.objects if thing not in self.world.seen]
         instruction = draft.sentences(scene.furniture, self.rng, hidden)[0]
-        self._budget = int(np.ceil(1.5 * typical_steps(draft.family))) + 2 + int(self.rng.choice((0, 0, 5, 10)))
+        self._budget = int(np.ceil(1.5 * family_of(draft.family).steps)) + 2 + int(self.rng.choice((0, 0, 5, 10)))
         self._steps = min(self._budget, _MAX_STEPS)
         self.mistakes = float(self.rng.choice(_MISTAKES))
         self.exercise = Exercise()
@@ -163,7 +172,7 @@ class _Episode:
         self._task = {
             "instruction": instruction,
             "robot": config.robots[index % len(config.robots)],
-            "category": category_of(draft.family),
+            "category": family_of(draft.family).category,
             "step_budget": self._budget,
             "named": list(draft.focus.values()),
         }
@@ -244,9 +253,10 @@ def _draft(config: CollectConfig, rng: np.random.Generator) -> tuple[Draft, Scen
     """A task in one of the rooms or in a made-up one."""
     while True:
         scene = scene_of(str(rng.choice(config.rooms))) if rng.random() < 0.5 else _made_up(rng)
-        family = str(rng.choice(FAMILIES[str(rng.choice(list(FAMILIES)))]))
+        category = str(rng.choice(CATEGORIES))
+        family = str(rng.choice([name for name in _FAMILIES if FAMILIES[name].category == category]))
         try:
-            return draw(family, scene, rng), scene
+            return draw(family, scene, rng, without=_LEFT_OUT), scene
         except NoDraft:
             continue
 

@@ -28,8 +28,9 @@ from sim.robots.spec import SIDES
 from sim.scene import BASE_JOINTS
 from sim.skills.body import ready_posture
 from sim.skills.obstacles import navigation_map
-from sim.tasks.drafts import FAMILIES, NoDraft, draw
-from sim.tasks.sample import rng_for, scene_of
+from sim.tasks.drafts import NoDraft
+from sim.tasks.families import FAMILIES, draw
+from sim.tasks.sample import UNSEEN_TYPES, rng_for, scene_of
 from sim.tasks.task import Placement
 from sim.world import World, WorldError
 
@@ -206,10 +207,9 @@ def _random_world(config: CollectConfig, index: int, rng: np.random.Generator) -
     robot = robot_kit(config.robots[index % len(config.robots)]).spec
     room = config.rooms[(index // len(config.robots)) % len(config.rooms)]
     scene = scene_of(room)
-    families = [family for names in FAMILIES.values() for family in names]
     for _ in range(60):
         try:
-            draft = draw(str(rng.choice(families)), scene, rng, distractors=(4, 9))
+            draft = draw(str(rng.choice(list(FAMILIES))), scene, rng, distractors=(4, 9), without=UNSEEN_TYPES)
             placements = [
                 Placement(name, name.rsplit("_", 1)[0], carrier, yaw_deg=float(rng.uniform(0.0, 360.0)))
                 for name, carrier in draft.objects.items()

@@ -9,18 +9,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+import mujoco
 import numpy as np
 
-from data.records import Action
+from data.records import Action, PlanStep
 from sim.navigation import Stance
 from sim.session import Session
 from sim.skills.locomotion import best_stance
+from sim.skills.registry import assess_action
 
 __all__ = ["HEIGHT_STEP_M", "Rehearsal"]
 
 #: Grid of the expert's height changes.
 HEIGHT_STEP_M: Final = 0.05
 _HEIGHTS: Final = 3
+#: Heights and choices of arms for two actions at once that are thought through at one stance.
+_TOGETHER: Final = 3
+#: How far a door or a drawer is imagined open.
+_PULLED_OPEN: Final = 0.95
 
 
 class Rehearsal:
@@ -67,6 +73,100 @@ class Rehearsal:
             body.hurried = False
             world.restore(saved)
         return False
+
+    def works_together(self, pairs: Sequence[tuple[Action, Action]], stance: Stance) -> bool:
+        """Whether two actions would both be tried from a stance at some height, for one of some choices of arms."""
+        world, body = self._session.world, self._session.body
+        saved = world.save()
+        body.hurried = True
+        try:
+            hopeful = [(h, pair) for h in self.heights_m() for pair in pairs if all(self._within(a, stance, h) for a in pair)]
+            for height, pair in hopeful[:_TOGETHER]:
+                self._put(stance, height)
+                if all(self._session.assess(action) is None for action in pair):
+                    return True
+        finally:
+            body.hurried = False
+            world.restore(saved)
+        return False
+
+    def _within(self, action: Action, stance: Stance, height_m: float) -> bool:
+        """Whether an action's object is within the arm's envelope; where something is put is not known yet."""
+        body = self._session.body
+        if action.name == "Place" or action.arm is None or action.object_id is None:
+            return True
+        self._put(stance, body.pelvis_height_m)
+        return body.within(action.arm, body.interaction_point(action.object_id), height_m)
+
+    def might_lead_to(self, first: Action, then: Action, stance: Stance, height_m: float) -> bool:
+        """Whether it is worth acting out an action, to see whether it leads to another one; asks kinematics only.
+
+        Args:
+            first: has to be possible from there; if it opens a door or a drawer, that stands open for `then`.
+            then: has to be possible after it, as far as that can be told.
+            stance: where the robot would stand.
+            height_m: pelvis height.
+        """
+        world, body = self._session.world, self._session.body
+        saved = world.save()
+        body.hurried = True
+        try:
+            self._put(stance, height_m)
+            if self._session.assess(first) is not None:
+                return False
+            if first.name != "Open" or first.object_id is None:
+                return True
+            self._pull_open(first.object_id)
+            known = {*self._session.known_objects, first.object_id, then.object_id or first.object_id}
+            return assess_action(body, then, frozenset(known)) is None
+        finally:
+            body.hurried = False
+            world.restore(saved)
+
+    def _pull_open(self, object_id: str) -> None:
+        """Puts a door or a drawer wide open; what lies in a drawer comes along."""
+        world = self._session.world
+        thing, contents = world.objects[object_id], world.contents(object_id)
+        for part in thing.moving:
+            frame = world.data.xpos[world.model.jnt_bodyid[part.joint_id]]
+            before = frame.copy()
+            world.data.qpos[part.qpos_adr] = part.range[0] + _PULLED_OPEN * (part.range[1] - part.range[0])
+            mujoco.mj_kinematics(world.model, world.data)
+            for name in contents:
+                address = world.objects[name].qpos_adr
+                world.data.qpos[address : address + 3] += frame - before
+        thing.openness = _PULLED_OPEN
+        mujoco.mj_kinematics(world.model, world.data)
+
+    def leads_to(self, first: Action, then: Action, stance: Stance | None = None, height_m: float | None = None) -> bool:
+        """Whether an action would be tried after another one has been acted out.
+
+        Args:
+            first: acted out in physics; undone afterwards.
+            then: only asked for.
+            stance: where the robot would stand, here when None.
+            height_m: pelvis height, the present one when None.
+        """
+        session = self._session
+        with session.imagining():
+            if stance is not None or height_m is not None:
+                base = session.body.commanded_base() if stance is None else stance
+                self._put(base, session.body.pelvis_height_m if height_m is None else height_m)
+            session.body.hurried = True
+            try:
+                if session.assess(first) is not None:
+                    return False
+                _, feedback = session.step(PlanStep((first,)))  # it also looks: what was shut away is known afterwards
+                return feedback.outcomes[0].success and session.assess(then) is None
+            finally:
+                session.body.hurried = False
+
+    def heights_m(self) -> list[float]:
+        """Pelvis heights worth trying, the present one first, then the nearest."""
+        low, high = self._session.body.spec.pelvis_height_range_m
+        present = self._session.body.pelvis_height_m
+        grid = [present + step * HEIGHT_STEP_M for step in (0, 1, -1, 2, -2, 4, -4, 6, -6, 8, -8)]
+        return [height for height in grid if low - 0.001 <= height <= high + 0.001]
 
     def _heights(self, actions: Sequence[Action], stance: Stance, present_m: float) -> list[float]:
         """The present height and the nearest ones at which the target is within the arms' envelope."""

@@ -7,8 +7,9 @@ Furniture is static, with joints for doors and drawers; movable objects have fre
 a body (`World.attach`). Paper: the DualTHOR scenes; balance control and cloth-like or liquid bodies are left out.
 
 Collision bits (`contype`/`conaffinity`), so that only pairs that matter are tested: static 1/0, movable 2/23, hands and
-forearms 4/3 (set in the robot's MJCF), held object 8/27, held door or drawer 16/0. Static geometry, doors, trunk and legs never
-meet each other; a held object or door does not meet the hands.
+forearms 4/3 (set in the robot's MJCF; 36/3 the left ones, 68/3 the right ones), held object 8/27, held door or drawer 16/64 or
+16/32. Static geometry, doors, trunk and legs never meet each other; a held object does not meet the hands, a held door does not
+meet the hand that holds it.
 """
 
 from __future__ import annotations
@@ -30,9 +31,11 @@ from sim.rooms import Room, load_room
 PUDDLES: Final = 6
 
 __all__ = [
+    "ARM_BITS",
     "BASE_JOINTS",
     "HELD_BITS",
     "HELD_DOOR_BITS",
+    "LIMB_BIT",
     "MOVABLE_BITS",
     "PUDDLES",
     "STATIC_BITS",
@@ -50,6 +53,9 @@ STATIC_BITS: Final = (1, 0)
 MOVABLE_BITS: Final = (2, 23)
 HELD_BITS: Final = (8, 27)
 HELD_DOOR_BITS: Final = (16, 0)
+#: Bit that forearm and hand of each arm have besides, so that a door in one hand meets the other arm.
+ARM_BITS: Final = {"left": 32, "right": 64}
+LIMB_BIT: Final = 4
 
 #: Position gain and damping ratio of the base servos, 20 ms to 30 ms behind their targets. Arms that reach out add inertia to
 #: the turns, so these are damped more.

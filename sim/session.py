@@ -10,7 +10,8 @@ Paper: problem formulation (observation, dual-arm action, feedback), undo and re
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -165,6 +166,7 @@ class Session:
         self._history: list[HistoryItem] = []
         self._ended = False
         self._opened = False
+        self._lucky = False
 
     # ---- episode
 
@@ -257,8 +259,21 @@ class Session:
             self.stats = dataclasses.replace(self.stats, path_length_m=self.stats.path_length_m + path)
         return Feedback(outcomes, self.world.time_s - started)
 
+    @contextmanager
+    def imagining(self) -> Iterator[None]:
+        """Steps taken inside are undone at its end, nobody watches them, and no contingency strikes; for the expert."""
+        before, watchers = self.snapshot(), self.watchers
+        self.watchers, self._lucky = [], True
+        try:
+            yield
+        finally:
+            self.restore(before)
+            self.watchers, self._lucky = watchers, False
+
     def draw(self, action: Action) -> str:
         """The contingency of an action at the present step."""
+        if self._lucky:
+            return "success"
         object_id = self.body.subject(action)
         thing = self.world.objects[object_id]
         state = {name: getattr(thing.state, name) for name in ("isFilledWithLiquid", "isToggled", "isDirty", "isBroken")}

@@ -51,6 +51,10 @@ _FRAMES_PER_TICK: Final = round(dynamics.TICK_S / FRAME_DT_S)
 _LIGHT_KG: Final = 1.5
 #: Free distance between objects that the world places by itself: a hand fits between.
 _HAND_GAP_M: Final = 0.09
+#: What a self-closing door or drawer is shut with, and how long its damper lets that take.
+_SPRING_TORQUE_N_M: Final = 2.0
+_SPRING_FORCE_N: Final = 6.0
+_CLOSING_S: Final = 1.2
 
 
 class WorldError(ValueError):
@@ -235,11 +239,26 @@ class World:
                 for part in thing.moving:
                     self.data.qpos[part.qpos_adr] = part.range[0] + float(value) * (part.range[1] - part.range[0])
                 thing.openness = float(value)
+            elif name == "selfClosing":
+                self._set_self_closing(thing, bool(value))
             elif name == "mass":
                 thing.mass_kg = float(value)
                 self._update_mass(thing)
             else:
                 self.set_state(thing.object_id, name, value)
+
+    def _set_self_closing(self, thing: ObjectInstance, value: bool) -> None:
+        """Puts springs on an object's doors or drawers that shut them, slowed by dampers, or takes the springs away."""
+        if value and (not thing.moving or any(part.spec.is_lid for part in thing.moving)):
+            raise WorldError(f"{thing.object_id} has no door or drawer, selfClosing=True is not possible")
+        thing.self_closing = value
+        for part in thing.moving:
+            hinge = int(self.model.jnt_type[part.joint_id]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+            shut, travel = _SPRING_TORQUE_N_M if hinge else _SPRING_FORCE_N, part.range[1] - part.range[0]
+            self.model.jnt_stiffness[part.joint_id] = 0.5 * shut / travel if value else 0.0
+            self.model.qpos_spring[part.qpos_adr] = part.range[0] - 2.0 * travel
+            if value:
+                self.model.dof_damping[part.dof_adr] = _CLOSING_S * 1.25 * shut / travel
 
     def _settle(self, seconds: float) -> None:
         for _ in range(round(seconds / TIMESTEP_S)):

@@ -82,7 +82,8 @@ def unmet_objects(task: Task, met: Sequence[bool]) -> frozenset[str]:
         task: the task.
         met: whether each of its goals held at the end.
     """
-    named = {name for goal, holds in zip(task.goals, met, strict=True) if not holds for name in goal.object_ids()}
+    ids = tuple(placement.object_id for placement in task.placements)
+    named = {name for goal, holds in zip(task.goals, met, strict=True) if not holds for name in goal.involved(ids)}
     return frozenset(named | {placement.receptacle for placement in task.placements if placement.object_id in named})
 
 

@@ -206,12 +206,12 @@ def read_rollouts(folder: Path) -> list[Rollout]:
     """All episodes of a shard folder.
 
     Raises:
-        ValueError: on a task of the benchmark, which must never be trained on.
+        ValueError: on a task that is not of the training split, such as one of the benchmark.
     """
     found: list[Rollout] = []
     for row in ShardReader(folder, "rollouts"):
-        if row["split"] == "benchmark":
-            raise ValueError(f"{folder}: episode {row['episode']!r} is of the benchmark; training refuses it")
+        if row["split"] != "train":
+            raise ValueError(f"{folder}: episode {row['episode']!r} is of split {row['split']!r}; training takes only 'train'")
         moments = tuple(
             Moment(m["step"], m["feedback"], bool(m["ok"]), tuple(m["visible"]), tuple(m["known"]))
             for m in json.loads(row["steps"])

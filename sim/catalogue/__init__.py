@@ -56,6 +56,7 @@ PROPERTIES: Final = (
     "cold_source",
     "cutter",
     "wiper",
+    "unsteady",
 )
 
 

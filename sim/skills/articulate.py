@@ -264,7 +264,7 @@ def open_close(body: Body, action: Action, luck: Luck) -> Skill:
             if attempt == 0:
                 raise
             break  # what the first time has done counts
-        if _share(body, pull.part) >= _OPEN_WELL if opening else _share(body, pull.part) <= _CLOSED_MAX:
+        if thing.held_by or _share(body, pull.part) >= _OPEN_WELL if opening else _share(body, pull.part) <= _CLOSED_MAX:
             return
     if opening and _share(body, thing.moving[0]) >= _OPEN_MIN:
         return
@@ -277,7 +277,7 @@ def _share(body: Body, part: MovingPart) -> float:
 
 
 def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
-    """Takes the handle, leads it, lets go and goes home.
+    """Takes the handle, leads it, lets go and goes home; a door that would fall shut is kept in the hand.
 
     Raises:
         SkillFailure: GraspMissed, or a contingency.
@@ -311,6 +311,8 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
     else:
         body.world.attach(arm.value, thing.object_id, part)
     yield from _lead(body, arm, pull)
+    if thing.self_closing and action.name == "Open" and _share(body, part) >= _OPEN_MIN:
+        return
     body.world.detach(arm.value)
     yield from body.move_hand(arm, 1.0, 0.2)
     position, hand = body.hand_pose(arm)

@@ -76,7 +76,7 @@ def check_place(body: Body, arm: Arm, receptacle: ObjectInstance) -> ObjectInsta
 def _check_receptacle(body: Body, receptacle: ObjectInstance, held: str) -> None:
     if not receptacle.type.receptacle or receptacle.object_id == held:
         raise SkillFailure(FailureCode.NOT_RECEPTACLE)
-    if receptacle.held_by:
+    if receptacle.held_by and receptacle.movable:  # a hand at a door holds it open
         raise SkillFailure(FailureCode.IN_USE)
     if receptacle.is_shut:
         raise SkillFailure(FailureCode.RECEPTACLE_CLOSED)
@@ -129,6 +129,12 @@ def check_hold(body: Body, arm: Arm, thing: ObjectInstance) -> None:
         raise SkillFailure(FailureCode.ALREADY_HELD)
 
 
+def _check_steady(body: Body, arm: Arm, thing: ObjectInstance) -> None:
+    """Refuses to work on what would roll or slide away, unless the other hand holds it where it rests."""
+    if thing.type.has("unsteady") and not (arm.other.value in thing.held_by and body.world.parents(thing.object_id)):
+        raise SkillFailure(FailureCode.NEEDS_STEADYING)
+
+
 def check_slice(body: Body, arm: Arm, thing: ObjectInstance) -> ObjectInstance:
     """Preconditions of Slice; returns the knife."""
     tool = _held(body, arm)
@@ -141,6 +147,7 @@ def check_slice(body: Body, arm: Arm, thing: ObjectInstance) -> ObjectInstance:
     if arm.value in thing.held_by:
         raise SkillFailure(FailureCode.IN_USE)
     _check_accessible(body, thing)
+    _check_steady(body, arm, thing)
     return tool
 
 
@@ -155,6 +162,7 @@ def check_clean(body: Body, arm: Arm, thing: ObjectInstance) -> ObjectInstance:
     if thing is tool:
         raise SkillFailure(FailureCode.IN_USE)
     _check_accessible(body, thing)
+    _check_steady(body, arm, thing)
     return tool
 
 

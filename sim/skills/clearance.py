@@ -135,7 +135,8 @@ class ClearanceProbe:
         world, scratch, model = self._world, self._scratch, self._world.model
         allowed = {geom for geom in ignore if isinstance(geom, int)}
         for name, thing in world.objects.items():
-            if thing.held_by or name in ignore:
+            mine = arm.value in thing.held_by
+            if name in ignore or mine or (thing.held_by and thing.movable):  # what the other hand holds open is in the way
                 allowed.update(map(int, thing.geom_ids))
         self._copy_state()
         if opening is not None:

@@ -2,7 +2,7 @@
 
 Hold is Pick without the lift: the object stays where it is and so does the hand, to steady it for the other one; a door or
 drawer is held by its handle. While furniture is held the robot does not walk. Release opens the hand wherever it is; what it
-held falls. Paper: holding and releasing of the dual-arm action space.
+held falls, and a door with a spring shuts. Paper: holding and releasing of the dual-arm action space.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def release(body: Body, action: Action, luck: Luck) -> Skill:
         yield from body.move_arm(arm, [back.q])
     yield from stow(body, arm, (name,))
     yield from wait(0.1)
-    for _ in range(int(1.0 / CONTROL_DT_S)):
-        if body.world.speed_of(thing.object_id) < 0.02:
+    for _ in range(int((3.0 if thing.self_closing else 1.0) / CONTROL_DT_S)):
+        if body.world.speed_of(thing.object_id) < 0.02 and not (thing.self_closing and thing.openness > 0.02):
             break
         yield

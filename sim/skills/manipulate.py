@@ -27,7 +27,20 @@ from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
 
-__all__ = ["Luck", "grip", "nudge", "pick", "place", "plan_bring", "plan_pick", "plan_place", "reset_arm", "retreat", "stow"]
+__all__ = [
+    "Luck",
+    "grip",
+    "nudge",
+    "pick",
+    "place",
+    "plan_bring",
+    "plan_pick",
+    "plan_place",
+    "reset_arm",
+    "retreat",
+    "stow",
+    "upright",
+]
 
 Array = NDArray[np.float64]
 
@@ -37,6 +50,9 @@ Luck = Callable[[Action], str]
 GRASP_GAP_M: Final = 0.015
 _APPROACH_M: Final = 0.09
 _LIFT_M: Final = 0.06
+#: Length of the straight way down onto a surface, and how far above the rim of a box or drawer it starts.
+_APPROACH_PLACE_M: Final = 0.08
+_OVER_RIM_M: Final = 0.02
 _MAX_PLANS: Final = 60
 #: Share of the usual speed at which liquids are carried.
 _CARE: Final = 0.6
@@ -109,7 +125,7 @@ def _carry(body: Body, arm: Arm, held: str) -> Array:
     """
     usual = body.carrying(arm)
     _, hand = body.hand_pose(arm)
-    turn = _upright(body.world.pose(held)[:3, :3])
+    turn = upright(body.world.pose(held)[:3, :3])
     pointing, closing = turn @ hand[:, 0], turn @ hand[:, 1]
     ahead = body.turn_to_world(np.array([1.0, 0.0, 0.0]))
     if np.hypot(*pointing[:2]) > 0.15:
@@ -127,7 +143,7 @@ def _level_way(body: Body, arm: Arm, held: str, goal: Array) -> list[Array]:
     """(A,) postures on the hand's straight way to carrying on which a vessel stays upright, as far as they exist."""
     start, end = body.hand_pose(arm)[0], body.hand_at(arm, goal)
     hand = body.hand_pose(arm)[1]
-    turn = _upright(body.world.pose(held)[:3, :3])
+    turn = upright(body.world.pose(held)[:3, :3])
     pointing, closing = turn @ hand[:, 0], turn @ hand[:, 1]
     way: list[Array] = []
     last = body.commanded_arm(arm)
@@ -275,7 +291,18 @@ def plan_place(body: Body, arm: Arm, thing: ObjectInstance, receptacle: ObjectIn
     spots = body.free_spots(thing, receptacle, arm)
     if not spots:
         raise SkillFailure(FailureCode.RECEPTACLE_FULL)
-    return plan_bring(body, arm, thing, spots, (thing.object_id, receptacle.object_id))
+    over_m = max(_APPROACH_PLACE_M, _rim_m(body, receptacle) - float(spots[0][2]) + _OVER_RIM_M)
+    return plan_bring(body, arm, thing, spots, (thing.object_id, receptacle.object_id), from_m=over_m)
+
+
+def _rim_m(body: Body, receptacle: ObjectInstance) -> float:
+    """World height of the rim of a drawer, box or vessel that is filled from above; minus infinity for other receptacles."""
+    data, model = body.world.data, body.world.model
+    parts = body.world.part_of_geom[receptacle.object_id]
+    hollow = {int(model.geom_bodyid[geom]) for geom, part in parts if part.shape in ("tray", "cup")}
+    around = [geom for geom, _ in parts if int(model.geom_bodyid[geom]) in hollow and model.geom_contype[geom] > 0]
+    halves = [float(np.abs(data.geom_xmat[geom].reshape(3, 3)[2]) @ model.geom_aabb[geom, 3:]) for geom in around]
+    return max((float(data.geom_xpos[geom, 2]) + half for geom, half in zip(around, halves, strict=True)), default=-np.inf)
 
 
 def plan_bring(
@@ -287,6 +314,7 @@ def plan_bring(
     point: Array | None = None,
     above_m: float = 0.006,
     coming_from: Array = _UP,
+    from_m: float = _APPROACH_PLACE_M,
 ) -> tuple[Array, Reach, Array]:
     """How the arm brings what it holds, upright, to one of some spots.
 
@@ -299,6 +327,7 @@ def plan_bring(
         point: (3,) point of the object that belongs above the spot, in its own frame; its frame's origin when None.
         above_m: height of the object's lowest point above the spot.
         coming_from: (3,) unit direction from the spot back to where the last straight way starts.
+        from_m: length of that way.
 
     Returns:
         The spot, the motion, and the direction in which the hand leaves.
@@ -309,7 +338,7 @@ def plan_bring(
     position, hand = body.hand_pose(arm)
     pose = body.world.pose(thing.object_id)
     # the object upright again, turned about the vertical only
-    tilt = _upright(pose[:3, :3])
+    tilt = upright(pose[:3, :3])
     middle = pose[:3, 3] if point is None else pose[:3, 3] + pose[:3, :3] @ point
     offset = tilt @ (middle - position)  # object frame from the hand
     pointing, closing = tilt @ hand[:, 0], tilt @ hand[:, 1]
@@ -328,7 +357,7 @@ def plan_bring(
             for extra in (0.0, 0.35, -0.35, 0.75, -0.75):
                 turn = _turn_z(straight + extra)
                 wish = HandPose(spot + lift - turn @ offset, turn @ pointing, turn @ closing)
-                reach = plan_reach(body, arm, wish, coming_from, 0.08, ignore, pointing=0.9, closing=0.93)
+                reach = plan_reach(body, arm, wish, coming_from, from_m, ignore, pointing=0.9, closing=0.93)
                 if reach is not None:
                     return spot, reach, -(turn @ pointing)
         raise SkillFailure(FailureCode.OBSTRUCTED)
@@ -426,7 +455,7 @@ def _turn_z(angle_rad: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _upright(rotation: Array) -> Array:
+def upright(rotation: Array) -> Array:
     """The smallest rotation that makes the object's z axis vertical again."""
     axis = np.cross(rotation[:, 2], _UP)
     sine, cosine = float(np.linalg.norm(axis)), float(rotation[2, 2])

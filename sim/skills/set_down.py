@@ -22,7 +22,7 @@ from sim.objects import ObjectInstance
 from sim.skills.body import Body, BothGoal, wait
 from sim.skills.checks import check_place_both
 from sim.skills.clearance import TOUCH_M
-from sim.skills.manipulate import Luck
+from sim.skills.manipulate import Luck, upright
 from sim.skills.reach import blame
 from sim.skills.reach_map import HandPose
 from sim.skills.remembered import remembered
@@ -140,7 +140,7 @@ class _Load:
         turned, sole_m = pose, float(pose[2, 3]) - bottom_m
         if float(np.arccos(np.clip(pose[2, 2], -1.0, 1.0))) > _LEANING_RAD:
             middle = 0.5 * (hands[Arm.LEFT][:3, 3] + hands[Arm.RIGHT][:3, 3])
-            turn = _uprighting(pose[:3, 2])
+            turn = upright(pose[:3, :3])
             turned = _pose(middle + turn @ (pose[:3, 3] - middle), turn @ pose[:3, :3])
             sole_m = -float(thing.local_min[2])
         return cls(thing, pose, turned, {arm: np.linalg.inv(pose) @ hand for arm, hand in hands.items()}, sole_m, bottom_m)
@@ -166,15 +166,6 @@ def _pose(position: Array, rotation: Array) -> Array:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, position
     return pose
-
-
-def _uprighting(up: Array) -> Array:
-    """(3, 3) smallest rotation that turns a unit direction up; none for one that points down."""
-    x, y, z = map(float, up)
-    if z < 0.0:
-        return np.eye(3)
-    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
-    return np.eye(3) + cross + cross @ cross / (1.0 + z)
 
 
 def _raised(body: Body, load: _Load, level_m: float, higher_m: float, lean_rad: float) -> BothGoal | None:

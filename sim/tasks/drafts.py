@@ -1,16 +1,13 @@
-"""Task families: what each one puts into a room and asks for, before positions are settled.
+"""Drafts: what a task puts into a room and asks for, before positions are settled.
 
 A draft says which objects stand on what and which predicates must hold; positions, start poses and step budgets come later (see
-`sim.tasks.sample`). Benchmark and training tasks are drawn by the same functions, so they differ in draws only, never in kind.
-
-Categories follow the paper. `single`: one arm is enough. `optional`: one arm can, two are faster. `essential`: one arm cannot,
-here because an object needs two hands (`lift`, `carry` and their combinations) or because two objects have to be in the hands
-at once (`hold_two`).
+`sim.tasks.sample`). The families that fill drafts are in `sim.tasks.families`. Benchmark and training tasks are drawn by the
+same functions, so they differ in draws only, never in kind. Paper: the DualTHOR task suite.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -19,28 +16,14 @@ import numpy as np
 from sim.tasks.instructions import phrase, preposition, shuffled, wordings
 from sim.tasks.predicates import Predicate
 
-__all__ = ["FAMILIES", "Draft", "NoDraft", "Scene", "category_of", "draw"]
-
-#: Families of each category.
-FAMILIES: Final[Mapping[str, tuple[str, ...]]] = {
-    "single": ("pick", "place", "open", "close", "toggle_on", "toggle_off"),
-    "optional": (
-        "transport_two",
-        "transport_each",
-        "pick_and_toggle_on",
-        "pick_and_toggle_off",
-        "pick_and_open",
-        "fetch",
-        "fetch_hold",
-        "stow",
-        "stow_close",
-    ),
-    "essential": ("lift", "carry", "hold_two", "carry_and_toggle", "carry_and_place"),
-}
-
+__all__ = ["Builder", "Draft", "NoDraft", "Scene"]
 
 #: Start states that make a type a load for two hands: a full pot, a packed box.
-_LOADS: Final[Mapping[str, Mapping[str, bool | float | str]]] = {"Pot": {"isFilledWithLiquid": True}, "Box": {"mass": 3.0}}
+_LOADS: Final[Mapping[str, Mapping[str, bool | float | str]]] = {
+    "Pot": {"isFilledWithLiquid": True},
+    "Box": {"mass": 3.0},
+    "LaundryHamper": {"mass": 3.0},
+}
 
 
 class NoDraft(ValueError):  # noqa: N818 - it reports a draw that a room cannot offer
@@ -58,8 +41,13 @@ class Scene:
         targets: surfaces with room for hands, onto which tasks move things.
         containers: furniture with a door or drawer that holds small objects.
         switches: furniture that can be turned on and off.
-        small: types that one hand picks up, with the furniture of `surfaces` and `containers` that fits them.
+        small: types that one hand picks up, with the furniture of `surfaces`, `targets` and `containers` that fits them.
         big: types that take two hands, with the furniture that carries them.
+        lids: furniture with a lid.
+        basins: basins with a tap, by the tap.
+        heaters: furniture that heats what is on or in it, by its switch.
+        near: for switches and containers, the surfaces, switches and containers that the other hand may reach meanwhile.
+        roomy: targets with room for several things.
     """
 
     room: str
@@ -70,6 +58,11 @@ class Scene:
     switches: tuple[str, ...]
     small: Mapping[str, tuple[str, ...]]
     big: Mapping[str, tuple[str, ...]]
+    lids: tuple[str, ...] = ()
+    basins: Mapping[str, str] = field(default_factory=dict)
+    heaters: Mapping[str, str] = field(default_factory=dict)
+    near: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    roomy: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
@@ -77,13 +70,15 @@ class Draft:
     """A task without positions.
 
     Attributes:
-        family: a name of `FAMILIES`.
+        family: a name of `sim.tasks.families.FAMILIES`.
         room: name of the layout.
         objects: carrier by object id, in the order of placing.
         object_states: start state by object id.
         states: start state of furniture by id.
         goals: what must hold.
-        focus: the ids that the instruction names, by slot (`a`, `b`, `r`, `s`).
+        focus: the ids that the instruction names, by slot (`a`, `b`, `c`, `r`, `s`).
+        words: slots that are filled with words instead of an object.
+        beside: objects that stand close to something else, furniture or an earlier object.
     """
 
     family: str
@@ -93,6 +88,8 @@ class Draft:
     states: dict[str, dict[str, bool | float | str]] = field(default_factory=dict)
     goals: list[Predicate] = field(default_factory=list)
     focus: dict[str, str] = field(default_factory=dict)
+    words: dict[str, str] = field(default_factory=dict)
+    beside: dict[str, str] = field(default_factory=dict)
 
     def sentences(self, furniture: Sequence[str], rng: np.random.Generator, hidden: Sequence[str] = ()) -> tuple[str, ...]:
         """The family's wordings for this draft, in random order.
@@ -112,52 +109,38 @@ class Draft:
         for slot, word in (("r", "pr"), ("s", "ps")):
             if slot in self.focus:
                 slots[word] = preposition(self.focus[slot])
-        return shuffled(wordings(self.family, slots), rng)
-
-
-def category_of(family: str) -> str:
-    """The category a family belongs to.
-
-    Raises:
-        KeyError: on an unknown family.
-    """
-    for category, families in FAMILIES.items():
-        if family in families:
-            return category
-    raise KeyError(f"unknown family {family!r}; allowed: {', '.join(name for names in FAMILIES.values() for name in names)}")
-
-
-def draw(family: str, scene: Scene, rng: np.random.Generator, distractors: tuple[int, int] = (1, 4)) -> Draft:
-    """Draws a task of a family in a room.
-
-    Args:
-        family: a name of `FAMILIES`.
-        scene: the room.
-        rng: source of randomness.
-        distractors: least and greatest number of objects that the task does not need.
-
-    Raises:
-        NoDraft: when the room lacks what the family needs.
-    """
-    category_of(family)
-    builder = _Builder(Draft(family, scene.room), scene, rng)
-    _FAMILY_BUILDERS[family](builder)
-    builder.add_distractors(int(rng.integers(distractors[0], distractors[1] + 1)))
-    return builder.draft
+        return shuffled(wordings(self.family, slots | self.words), rng)
 
 
 @dataclass(slots=True)
-class _Builder:
+class Builder:
+    """Fills a draft with draws from a scene.
+
+    Attributes:
+        draft: what has been decided so far.
+        scene: what the room offers.
+        rng: source of randomness.
+        without: types that are left out, as subjects and as distractors.
+    """
+
     draft: Draft
     scene: Scene
     rng: np.random.Generator
+    without: Collection[str] = ()
 
     def choose(self, options: Sequence[str], what: str) -> str:
+        """One of some options.
+
+        Raises:
+            NoDraft: when there are none.
+        """
+        options = [option for option in options if option.rsplit("_", 1)[0] not in self.without]
         if not options:
             raise NoDraft(f"{self.scene.room} has no {what} for {self.draft.family}")
         return options[int(self.rng.integers(len(options)))]
 
     def add(self, object_type: str, carrier: str) -> str:
+        """Adds an object of a type and returns its id."""
         number = 1 + sum(
             object_id.rsplit("_", 1)[0] == object_type for object_id in (*self.draft.objects, *self.scene.furniture)
         )
@@ -165,53 +148,86 @@ class _Builder:
         self.draft.objects[object_id] = carrier
         return object_id
 
-    def unused(self, table: Mapping[str, tuple[str, ...]], *needed: str) -> list[str]:
-        """Types not yet in the room that fit all of the needed furniture and at least one surface."""
+    def unused(self, table: Mapping[str, tuple[str, ...]], *needed: str, among: Sequence[str] = ()) -> list[str]:
+        """Types not yet in the room that fit all of the needed furniture and at least one surface, of some types or of all."""
         present = {object_id.rsplit("_", 1)[0] for object_id in (*self.draft.objects, *self.scene.furniture)}
         return [
             object_type
             for object_type, fits in table.items()
-            if object_type not in present and all(place in fits for place in needed) and set(fits) & set(self.scene.surfaces)
+            if object_type not in present
+            and (not among or object_type in among)
+            and all(place in fits for place in needed)
+            and set(fits) & set(self.scene.surfaces)
         ]
 
-    def small(self, *needed: str, at: str = "", avoid: Sequence[str] = ()) -> str:
+    def small(self, *needed: str, at: str = "", avoid: Sequence[str] = (), among: Sequence[str] = ()) -> str:
         """Adds a new small object that fits `needed`, at `at` or on a random surface other than `avoid`."""
-        object_type = self.choose(self.unused(self.scene.small, *needed, *((at,) if at else ())), "fitting small object")
+        options = self.unused(self.scene.small, *needed, *((at,) if at else ()), among=among)
+        object_type = self.choose(options, "fitting small object")
         fits = self.scene.small[object_type]
         place = at or self.choose([s for s in self.scene.surfaces if s in fits and s not in avoid], "free surface")
         return self.add(object_type, place)
 
-    def big(self, target: str = "") -> str:
+    def near(self, object_id: str, *needed: str, among: Sequence[str] = ()) -> str:
+        """Adds a new small object beside another one."""
+        return self.small(*needed, at=self.draft.objects[object_id], among=among)
+
+    def big(self, target: str = "", among: Sequence[str] = ()) -> str:
         """Adds a new two-handed object that can be carried to `target`, on other furniture."""
-        object_type = self.choose(self.unused(self.scene.big, *((target,) if target else ())), "two-handed object")
+        options = self.unused(self.scene.big, *((target,) if target else ()), among=among)
+        object_type = self.choose(options, "two-handed object")
         place = self.choose([s for s in self.scene.big[object_type] if s != target], "furniture for a two-handed object")
         object_id = self.add(object_type, place)
         if object_type in _LOADS:
             self.draft.object_states[object_id] = dict(_LOADS[object_type])
         return object_id
 
-    def big_target(self) -> str:
+    def big_target(self, among: Sequence[str] = ()) -> str:
         """Furniture that a two-handed object can be carried to from elsewhere."""
-        options = sorted({place for fits in self.scene.big.values() if len(fits) > 1 for place in fits})
+        table = {kind: fits for kind, fits in self.scene.big.items() if not among or kind in among}
+        options = sorted({place for fits in table.values() if len(fits) > 1 for place in fits})
         return self.choose(options, "furniture for a two-handed object")
 
+    def target(self, *others: str, roomy: bool = False) -> str:
+        """Furniture to put things on, different from some, with room for several when asked."""
+        places = self.scene.roomy if roomy else self.scene.targets
+        return self.choose([place for place in places if place not in others], "surface")
+
+    def pair(self, first: Sequence[str], second: Sequence[str], what: str) -> tuple[str, str]:
+        """Furniture of two kinds that both hands may reach from one place."""
+        pairs = [f"{a} {c}" for a in first for c in self.scene.near.get(a, ()) if c in second]
+        a, c = self.choose(pairs, what).split()
+        return a, c
+
     def switch(self, on: bool, avoid: Sequence[str] = ()) -> str:
+        """A switch of the room that is off, or `on`, at the start."""
         switch = self.choose([s for s in self.scene.switches if s not in avoid], "switch")
         self.draft.states.setdefault(switch, {})["isToggled"] = on
         return switch
 
-    def container(self, is_open: bool) -> str:
-        container = self.choose(self.scene.containers, "container")
-        self.draft.states.setdefault(container, {})["isOpen"] = is_open
+    def container(self, is_open: bool, falls_shut: bool = False, among: Sequence[str] = ()) -> str:
+        """A container of the room that is closed, or `is_open`, at the start, and may shut by itself."""
+        options = [name for name in self.scene.containers if not among or name.rsplit("_", 1)[0] in among]
+        container = self.choose(options, "container")
+        state = self.draft.states.setdefault(container, {})
+        state["isOpen"] = is_open
+        if falls_shut:
+            state["selfClosing"] = True
         return container
 
+    def start(self, object_id: str, **state: bool | float | str) -> None:
+        """Gives an object a start state."""
+        self.draft.object_states.setdefault(object_id, {}).update(state)
+
     def ask(self, *goals: Predicate, **focus: str) -> None:
+        """Adds goals, and the objects that the instruction names."""
         self.draft.goals.extend(goals)
         self.draft.focus.update(focus)
 
     def add_distractors(self, count: int) -> None:
+        """Adds small objects that the task does not need."""
         for _ in range(count):
-            options = self.unused(self.scene.small)
+            options = [kind for kind in self.unused(self.scene.small) if kind not in self.without]
             if not options:
                 return
             object_type = self.choose(options, "distractor")
@@ -219,154 +235,3 @@ class _Builder:
             places = [s for s in self.scene.surfaces if s in self.scene.small[object_type] and crowd.count(s) < 3]
             if places:
                 self.add(object_type, self.choose(places, "free surface"))
-
-
-def _located(object_id: str, receptacle: str) -> Predicate:
-    return Predicate(preposition(receptacle), object_id, receptacle)  # type: ignore[arg-type]
-
-
-def _pick(b: _Builder) -> None:
-    a = b.small()
-    b.ask(Predicate("held", a), a=a)
-
-
-def _place(b: _Builder) -> None:
-    r = b.choose(b.scene.targets, "surface")
-    a = b.small(r, avoid=(r,))
-    b.ask(_located(a, r), a=a, r=r)
-
-
-def _open(b: _Builder) -> None:
-    a = b.container(is_open=False)
-    b.small()
-    b.ask(Predicate("open", a), a=a)
-
-
-def _close(b: _Builder) -> None:
-    a = b.container(is_open=True)
-    b.small()
-    b.ask(Predicate("closed", a), a=a)
-
-
-def _toggle_on(b: _Builder) -> None:
-    a = b.switch(on=False)
-    b.small()
-    b.ask(Predicate("toggled_on", a), a=a)
-
-
-def _toggle_off(b: _Builder) -> None:
-    a = b.switch(on=True)
-    b.small()
-    b.ask(Predicate("toggled_off", a), a=a)
-
-
-def _transport_two(b: _Builder) -> None:
-    r = b.choose(b.scene.targets, "surface")
-    a = b.small(r, avoid=(r,))
-    # Half of the time both stand together, so that both hands can reach at once.
-    source = b.draft.objects[a]
-    c = b.small(r, at=source) if b.rng.random() < 0.5 else b.small(r, avoid=(r,))
-    b.ask(_located(a, r), _located(c, r), a=a, b=c, r=r)
-
-
-def _transport_each(b: _Builder) -> None:
-    r = b.choose(b.scene.targets, "surface")
-    s = b.choose([place for place in b.scene.targets if place != r], "second surface")
-    a = b.small(r, avoid=(r, s))
-    c = b.small(s, avoid=(r, s))
-    b.ask(_located(a, r), _located(c, s), a=a, b=c, r=r, s=s)
-
-
-def _pick_and_toggle(on: bool) -> Callable[[_Builder], None]:
-    def build(b: _Builder) -> None:
-        a = b.small()
-        switch = b.switch(on=not on)
-        b.ask(Predicate("held", a), Predicate("toggled_on" if on else "toggled_off", switch), a=a, b=switch)
-
-    return build
-
-
-def _pick_and_open(b: _Builder) -> None:
-    a = b.small()
-    c = b.container(is_open=False)
-    b.ask(Predicate("held", a), Predicate("open", c), a=a, b=c)
-
-
-def _fetch(b: _Builder) -> None:
-    s = b.container(is_open=False)
-    r = b.choose(b.scene.targets, "surface")
-    a = b.small(r, at=s)
-    b.ask(_located(a, r), a=a, r=r, s=s)
-
-
-def _fetch_hold(b: _Builder) -> None:
-    s = b.container(is_open=False)
-    a = b.small(at=s)
-    b.ask(Predicate("held", a), a=a, s=s)
-
-
-def _stow(b: _Builder) -> None:
-    r = b.container(is_open=False)
-    a = b.small(r)
-    b.ask(_located(a, r), a=a, r=r)
-
-
-def _stow_close(b: _Builder) -> None:
-    _stow(b)
-    b.ask(Predicate("closed", b.draft.focus["r"]))
-
-
-def _lift(b: _Builder) -> None:
-    a = b.big()
-    b.small()
-    b.ask(Predicate("lifted", a), a=a)
-
-
-def _carry(b: _Builder) -> None:
-    r = b.big_target()
-    a = b.big(r)
-    b.ask(_located(a, r), a=a, r=r)
-
-
-def _hold_two(b: _Builder) -> None:
-    a = b.small()
-    c = b.small(at=b.draft.objects[a]) if b.rng.random() < 0.5 else b.small()
-    b.ask(Predicate("held", a), Predicate("held", c), a=a, b=c)
-
-
-def _carry_and_toggle(b: _Builder) -> None:
-    _carry(b)
-    switch = b.switch(on=False)
-    b.ask(Predicate("toggled_on", switch), b=switch)
-
-
-def _carry_and_place(b: _Builder) -> None:
-    _carry(b)
-    r = b.draft.focus["r"]
-    s = b.choose([place for place in b.scene.targets if place != r], "second surface")
-    c = b.small(s, avoid=(s,))
-    b.ask(_located(c, s), b=c, s=s)
-
-
-_FAMILY_BUILDERS: Final[Mapping[str, Callable[[_Builder], None]]] = {
-    "pick": _pick,
-    "place": _place,
-    "open": _open,
-    "close": _close,
-    "toggle_on": _toggle_on,
-    "toggle_off": _toggle_off,
-    "transport_two": _transport_two,
-    "transport_each": _transport_each,
-    "pick_and_toggle_on": _pick_and_toggle(on=True),
-    "pick_and_toggle_off": _pick_and_toggle(on=False),
-    "pick_and_open": _pick_and_open,
-    "fetch": _fetch,
-    "fetch_hold": _fetch_hold,
-    "stow": _stow,
-    "stow_close": _stow_close,
-    "lift": _lift,
-    "carry": _carry,
-    "hold_two": _hold_two,
-    "carry_and_toggle": _carry_and_toggle,
-    "carry_and_place": _carry_and_place,
-}

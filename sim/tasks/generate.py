@@ -1,201 +1,229 @@
-"""Generates the benchmark: tasks that the expert has solved on every robot, with budgets from its plans.
+"""Generates the benchmark: 359 tasks that the expert has solved on every robot, with budgets from its plans.
 
     python -m sim.tasks.generate               # writes benchmark.jsonl and certificates.jsonl
     python -m sim.tasks.generate --check       # rebuilds every task from its seed, solves it again, compares bytes
     python -m sim.tasks.generate --check-fast  # the same without solving: budgets are taken as they are
+    python -m sim.tasks.generate --table       # the certificates per family and robot, as Markdown
 
-Each slot (family and room) tries its seeds in order and keeps the first tasks that both robots solve at difficulty easy within
-a sensible number of steps. Step budget: 1.5 times the longer plan, rounded up, plus 2. A certificate holds each robot's plan.
-
-Choices within the paper's categories: `essential` tasks lift or carry something that needs two hands, or end with one object
-in each hand; doors here have no closing spring, so holding a door open while storing is no essential task.
+A slot is a family in a room. Its seeds are tried in order, and those tasks are kept whose certificates say what their category
+promises (`sim.tasks.certificates`), whose instruction is new, and whose subject has not yet been asked for too often. What a
+room cannot give is taken from the family's other rooms. Both checks print counts per category, family, room, split and type as
+JSON. Generating takes hours on two cores; what has been tried is kept in `outputs/tasks`, by a hash of the simulator's files,
+so that it goes on where it was stopped.
 """
 
 from __future__ import annotations
 
+import argparse
+import hashlib
 import json
 import logging
 import multiprocessing
 import sys
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
+from tqdm import tqdm
 
+import sim
 from data.files import write_text
-from sim.tasks.sample import ROBOTS, sample_task, typical_steps
-from sim.tasks.task import BENCHMARK_PATH, MAX_STEPS, Task, load_benchmark, tasks_text, write_tasks
+from data.workers import start_worker
+from sim.tasks.certificates import (
+    CERTIFICATES_PATH,
+    Certificate,
+    Refusal,
+    certificates_table,
+    certificates_text,
+    certified,
+    load_certificates,
+)
+from sim.tasks.composition import COMPOSITION, Share
+from sim.tasks.sample import BIG_TYPES, sample_task
+from sim.tasks.task import BENCHMARK_PATH, Task, load_benchmark, tasks_text, write_tasks
+from sim.world import WorldError
 
-__all__ = ["CERTIFICATES_PATH", "SLOTS", "Certificate", "Slot", "budget_of", "certify", "generate", "main", "rebuild"]
+__all__ = ["Slot", "counts", "generate", "main", "moved", "rebuild", "slots"]
 
 _LOG = logging.getLogger(__name__)
 
-CERTIFICATES_PATH: Final = Path(__file__).parent / "certificates.jsonl"
-_SEEDS_PER_SLOT: Final = 1000
-_TRIES: Final = 40
-#: Steps beyond the family's typical number that a certified plan may take.
-_EXTRA_STEPS: Final = 5
-_SEARCH_BUDGET: Final = 30
+_SEEDS_PER_SLOT: Final = 200
+#: Seeds that a slot tries per task that it has to find.
+_TRIES: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """A family in a room, and how many tasks of it the benchmark has."""
+    """A family in a room.
 
+    Attributes:
+        number: its place in the composition; its seeds follow from it.
+        family: family of its tasks.
+        room: room of its tasks.
+        count: how many of them the benchmark has.
+        spare: whether it is asked only when the family's other rooms are exhausted.
+    """
+
+    number: int
     family: str
     room: str
     count: int
+    spare: bool = False
+
+    @property
+    def seeds(self) -> range:
+        """The seeds it tries."""
+        first = self.number * _SEEDS_PER_SLOT
+        return range(first, first + min(_SEEDS_PER_SLOT, _TRIES * self.count))
+
+    @property
+    def more_seeds(self) -> bool:
+        """Whether one more task would let it try more seeds."""
+        return _TRIES * self.count < _SEEDS_PER_SLOT
 
 
-#: The benchmark's composition: 12 tasks per category.
-SLOTS: Final = (
-    Slot("pick", "kitchen_1", 2),
-    Slot("pick", "living_room_1", 1),
-    Slot("place", "kitchen_1", 2),
-    Slot("place", "living_room_1", 1),
-    Slot("open", "kitchen_1", 1),
-    Slot("open", "living_room_1", 1),
-    Slot("close", "kitchen_1", 1),
-    Slot("toggle_on", "kitchen_1", 1),
-    Slot("toggle_on", "living_room_1", 1),
-    Slot("toggle_off", "kitchen_1", 1),
-    Slot("transport_two", "kitchen_1", 2),
-    Slot("pick_and_toggle_off", "kitchen_1", 1),
-    Slot("transport_each", "kitchen_1", 1),
-    Slot("pick_and_toggle_on", "kitchen_1", 1),
-    Slot("fetch_hold", "kitchen_1", 1),
-    Slot("pick_and_open", "kitchen_1", 1),
-    Slot("pick_and_open", "living_room_1", 1),
-    Slot("fetch", "kitchen_1", 1),
-    Slot("fetch_hold", "living_room_1", 1),
-    Slot("stow", "living_room_1", 1),
-    Slot("stow_close", "kitchen_1", 1),
-    Slot("lift", "kitchen_1", 2),
-    Slot("lift", "living_room_1", 2),
-    Slot("carry", "kitchen_1", 1),
-    Slot("carry", "living_room_1", 2),
-    Slot("hold_two", "kitchen_1", 2),
-    Slot("hold_two", "living_room_1", 2),
-    Slot("carry_and_toggle", "living_room_1", 1),
-)
+def slots(composition: Sequence[Share] = COMPOSITION) -> tuple[Slot, ...]:
+    """Every family's tasks, dealt out to its rooms in turn; a room that gets none stands in for the others."""
+    found: list[Slot] = []
+    for share in composition:
+        for index, room in enumerate(share.rooms):
+            count = share.count // len(share.rooms) + (index < share.count % len(share.rooms))
+            found.append(Slot(len(found), share.family, room, count))
+        found += [Slot(len(found) + index, share.family, room, 0, spare=True) for index, room in enumerate(share.spare)]
+    return tuple(found)
 
 
-@dataclass(frozen=True, slots=True)
-class Certificate:
-    """Proof that a robot can solve a task.
+def moved(wanted: Sequence[Slot], found: Mapping[int, int], totals: Mapping[str, int]) -> list[Slot]:
+    """The slots that have to find more, because others of their family found fewer than they were to.
 
-    Attributes:
-        task: task id.
-        robot: robot name.
-        plan: the expert's steps.
-        makespan_s: simulated seconds.
-        path_length_m: length of the base's path.
-        arm_utilisation: mean fraction of arm-steps in which an arm acted.
+    Args:
+        wanted: all slots, with the counts they were to find.
+        found: how many each one found, by its number.
+        totals: tasks that each family is to have.
+
+    Raises:
+        RuntimeError: when only families are short whose rooms are all exhausted; the message names them.
     """
-
-    task: str
-    robot: str
-    plan: tuple[str, ...]
-    makespan_s: float
-    path_length_m: float
-    arm_utilisation: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain form; simulated quantities are rounded, steps are exact."""
-        return {
-            "task": self.task,
-            "robot": self.robot,
-            "steps": len(self.plan),
-            "plan": list(self.plan),
-            "makespan_s": round(self.makespan_s, 1),
-            "path_length_m": round(self.path_length_m, 1),
-            "arm_utilisation": round(self.arm_utilisation, 3),
-        }
+    more: list[Slot] = []
+    short: list[str] = []
+    for family, total in totals.items():
+        rooms = [slot for slot in wanted if slot.family == family]
+        missing = total - sum(found[slot.number] for slot in rooms)
+        able = [slot for slot in rooms if found[slot.number] == slot.count and slot.more_seeds]
+        able = [slot for slot in able if not slot.spare] or able
+        if missing and not able:
+            short.append(f"{family}: {missing} of {total}")
+            continue
+        for index, slot in enumerate(able):
+            extra = missing // len(able) + (index < missing % len(able))
+            more += [replace(slot, count=slot.count + extra)] if extra else []
+    if short and not more:
+        raise RuntimeError("no room gives the missing tasks of " + "; ".join(short))
+    return more
 
 
-def budget_of(steps: Sequence[int]) -> int:
-    """Step budget from the numbers of steps that the expert took on the robots."""
-    return min(MAX_STEPS, int(np.ceil(1.5 * max(steps))) + 2)
+def _attempt(slot: Slot, seed: int) -> tuple[Task, tuple[Certificate, ...]]:
+    """The task of a seed with its certificates.
+
+    Raises:
+        ValueError: when the seed makes no task, or one that is not certified.
+        WorldError: when its objects do not fit.
+    """
+    return certified(sample_task(seed, slot.room, slot.family, "benchmark"))
 
 
-def certify(task: Task, robot: str) -> Certificate | None:
-    """The expert's solution on a robot at difficulty easy, None when it fails."""
-    from sim.expert import Expert
-    from sim.session import Session
-
-    session = Session(robot, "easy", image_size=0)
-    try:
-        session.reset(task, seed=task.seed)
-        expert = Expert(session)
-        expert.reset()
-        while not session.finished:
-            session.step(expert.next_step())
-        stats = session.stats
-        plan = tuple(item.step for item in session.history)
-        if not session.succeeded or plan[-1] == "Done()":
-            return None
-        return Certificate(task.id, robot, plan, stats.makespan_s, stats.path_length_m, stats.arm_utilisation)
-    finally:
-        session.close()
+def _subject(task: Task) -> str:
+    """Type of what the task is about first; of the few things that take two hands, also where they go."""
+    goal = task.goals[0]
+    kind = goal.object_type or next(iter(goal.object_ids())).rsplit("_", 1)[0]
+    return f"{kind} {goal.receptacle_id}" if kind in BIG_TYPES else kind
 
 
-def _solved(task: Task) -> tuple[Task, tuple[Certificate, ...]] | None:
-    """The task with its budget and certificates, None when some robot fails or needs too long."""
-    limit = typical_steps(task.family) + _EXTRA_STEPS
-    found: list[Certificate] = []
-    for robot in ROBOTS:
-        certificate = certify(replace(task, step_budget=min(limit, _SEARCH_BUDGET)), robot)
-        if certificate is None:
-            return None
-        found.append(certificate)
-    return replace(task, step_budget=budget_of([len(c.plan) for c in found])), tuple(found)
+def fill(slot: Slot, folder: Path) -> list[tuple[Task, tuple[Certificate, ...]]]:
+    """A slot's tasks, with different instructions and subjects as varied as the room allows.
 
-
-def _fill(number: int, slot: Slot) -> list[tuple[Task, tuple[Certificate, ...]]]:
-    """The slot's tasks, with different instructions."""
+    Args:
+        slot: what is wanted.
+        folder: where what has been tried is kept.
+    """
+    cache = folder / f"{slot.family}-{slot.room}.jsonl"
+    tried = _read(cache)
     found: list[tuple[Task, tuple[Certificate, ...]]] = []
-    for seed in range(number * _SEEDS_PER_SLOT, number * _SEEDS_PER_SLOT + _TRIES * slot.count):
-        if len(found) == slot.count:
-            break
-        try:
-            task = sample_task(seed, slot.room, slot.family, "benchmark")
-        except ValueError:
-            continue
-        if any(task.instruction == other.instruction for other, _ in found):
-            continue
-        solved = _solved(task)
-        _LOG.info("%s seed %d: %s", slot, seed, "kept" if solved else "not solved")
-        if solved is not None:
-            found.append(solved)
+    with cache.open("a", encoding="utf-8") as log:
+        for seed in slot.seeds:
+            if len(found) == slot.count:
+                break
+            if seed not in tried:
+                line: dict[str, Any] = {"seed": seed}
+                try:
+                    task, proofs = _attempt(slot, seed)
+                    tried[seed] = task, proofs
+                    line |= {"task": task.to_json(), "proofs": [proof.to_json() for proof in proofs]}
+                except (ValueError, WorldError) as error:
+                    tried[seed] = None
+                    line["refused"] = f"{type(error).__name__}: {error}"
+                log.write(json.dumps(line) + "\n")
+                log.flush()
+            candidate = tried[seed]
+            if candidate is None:
+                continue
+            subjects = Counter(_subject(task) for task, _ in found)
+            often = 1 + slot.count // 3
+            words = {task.instruction for task, _ in found}
+            if candidate[0].instruction not in words and subjects[_subject(candidate[0])] < often:
+                found.append(candidate)
     return found
 
 
-def _fill_star(arguments: tuple[int, Slot]) -> list[tuple[Task, tuple[Certificate, ...]]]:
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    return _fill(*arguments)
+def _read(path: Path) -> dict[int, tuple[Task, tuple[Certificate, ...]] | None]:
+    """What a slot has tried before, by seed; a last line that was cut short is left out."""
+    tried: dict[int, tuple[Task, tuple[Certificate, ...]] | None] = {}
+    if path.is_file():
+        content = path.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        if whole != content:
+            path.write_bytes(whole)
+        for line in whole.decode().splitlines():
+            record = json.loads(line)
+            proofs = tuple(Certificate.from_json(proof) for proof in record.get("proofs", ()))
+            tried[record["seed"]] = (Task.from_json(record["task"]), proofs) if proofs else None
+    return tried
 
 
-def generate(workers: int = 2) -> tuple[list[Task], list[Certificate]]:
+def _fill_star(arguments: tuple[Slot, Path]) -> list[tuple[Task, tuple[Certificate, ...]]]:
+    return fill(*arguments)
+
+
+def generate(folder: Path, workers: int = 2) -> tuple[list[Task], list[Certificate]]:
     """Searches all slots.
 
+    Args:
+        folder: where what has been tried is kept.
+        workers: processes.
+
     Raises:
-        RuntimeError: when a slot cannot be filled.
+        RuntimeError: when a family's rooms do not give as many tasks as they should.
     """
+    folder.mkdir(parents=True, exist_ok=True)
+    filled: dict[int, list[tuple[Task, tuple[Certificate, ...]]]] = {}
+    wanted = {slot.number: slot for slot in slots()}
+    totals = {share.family: share.count for share in COMPOSITION}
+    search = list(wanted.values())
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        filled = list(pool.map(_fill_star, enumerate(SLOTS)))
-    tasks: list[Task] = []
-    certificates: list[Certificate] = []
-    for slot, found in zip(SLOTS, filled, strict=True):
-        if len(found) < slot.count:
-            raise RuntimeError(f"{slot}: only {len(found)} of {slot.count} tasks in {_TRIES * slot.count} seeds")
-        for task, proofs in found:
-            tasks.append(task)
-            certificates.extend(proofs)
-    return tasks, certificates
+    with ProcessPoolExecutor(workers, context, start_worker) as pool:
+        while search:
+            results = pool.map(_fill_star, [(slot, folder) for slot in search])
+            for slot, found in zip(search, tqdm(results, total=len(search), desc="slots", unit="slot"), strict=True):
+                filled[slot.number] = found
+            # A room that is exhausted keeps what it found, and its family's other rooms are asked for the rest.
+            search = moved(list(wanted.values()), {number: len(found) for number, found in filled.items()}, totals)
+            wanted |= {slot.number: slot for slot in search}
+    ordered = [filled[number] for number in sorted(filled)]
+    tasks = [task for found in ordered for task, _ in found]
+    return tasks, [proof for found in ordered for _, proofs in found for proof in proofs]
 
 
 def rebuild(task: Task, solve: bool) -> tuple[Task, tuple[Certificate, ...]]:
@@ -206,57 +234,103 @@ def rebuild(task: Task, solve: bool) -> tuple[Task, tuple[Certificate, ...]]:
         solve: whether the budget comes from the expert again, or is taken over.
 
     Raises:
-        RuntimeError: when the expert does not solve it any more.
+        Refusal: when the expert does not solve it any more as its category says.
     """
     fresh = sample_task(task.seed, task.room, task.family, "benchmark")
     if not solve:
         return replace(fresh, step_budget=task.step_budget), ()
-    solved = _solved(fresh)
-    if solved is None:
-        raise RuntimeError(f"{task.id}: the expert does not solve it any more")
-    return solved
+    try:
+        return certified(fresh)
+    except Refusal as refusal:
+        raise Refusal(f"{task.id}: {refusal}") from refusal
 
 
-def _rebuild_star(arguments: tuple[Task, bool]) -> tuple[Task, tuple[Certificate, ...]]:
-    return rebuild(*arguments)
+def _rebuilt(arguments: tuple[Task, bool]) -> tuple[Task | str, tuple[Certificate, ...]]:
+    try:
+        return rebuild(*arguments)
+    except (ValueError, WorldError) as error:
+        return f"{arguments[0].id}: {error}", ()
 
 
-def _certificates_text(certificates: Sequence[Certificate]) -> str:
-    return "".join(json.dumps(certificate.to_json()) + "\n" for certificate in certificates)
-
-
-def _check(solve: bool) -> Mapping[str, str]:
-    """Differences between the files and what their seeds make, by file name."""
+def _check(solve: bool) -> Iterator[str]:
+    """Differences between the files and what their seeds make."""
     tasks = load_benchmark()
-    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
-        rebuilt = list(pool.map(_rebuild_star, [(task, solve) for task in tasks]))
-    problems: dict[str, str] = {}
-    if tasks_text([task for task, _ in rebuilt]) != BENCHMARK_PATH.read_text(encoding="utf-8"):
-        changed = [old.id for old, (new, _) in zip(tasks, rebuilt, strict=True) if old != new]
-        problems[BENCHMARK_PATH.name] = f"differs for {', '.join(changed) or 'its formatting'}"
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn"), start_worker) as pool:
+        results = pool.map(_rebuilt, [(task, solve) for task in tasks])
+        rebuilt = list(tqdm(results, total=len(tasks), desc="check", unit="task"))
+    yield from (str(new) for new, _ in rebuilt if isinstance(new, str))
+    changed = [old.id for old, (new, _) in zip(tasks, rebuilt, strict=True) if not isinstance(new, str) and old != new]
+    if changed:
+        yield f"{BENCHMARK_PATH.name}: differs for {', '.join(changed)}"
+    if tasks_text(tasks) != BENCHMARK_PATH.read_text(encoding="utf-8"):
+        yield f"{BENCHMARK_PATH.name}: differs in its formatting"
     if solve:
-        text = _certificates_text([proof for _, proofs in rebuilt for proof in proofs])
+        text = certificates_text([proof for _, proofs in rebuilt for proof in proofs])
         if text != CERTIFICATES_PATH.read_text(encoding="utf-8"):
-            problems[CERTIFICATES_PATH.name] = "differs"
-    return problems
+            yield f"{CERTIFICATES_PATH.name}: differs"
+
+
+def counts(tasks: Sequence[Task]) -> dict[str, Any]:
+    """How many tasks there are per category, family, room, split and type; a task counts once for each type in it."""
+
+    def table(values: Iterator[str]) -> dict[str, int]:
+        return dict(sorted(Counter(values).items()))
+
+    return {
+        "tasks": len(tasks),
+        "category": table(task.category for task in tasks),
+        "family": table(task.family for task in tasks),
+        "room": table(task.room for task in tasks),
+        "split": table(task.split for task in tasks),
+        "type_named": table(kind for task in tasks for kind in named_types(task)),
+        "type_placed": table(kind for task in tasks for kind in {p.object_type for p in task.placements}),
+    }
+
+
+def named_types(task: Task) -> set[str]:
+    """Types of the objects that the goals are about, and of the furniture whose state the task sets."""
+    ids = [placement.object_id for placement in task.placements]
+    goals = {name for goal in task.goals for name in goal.involved(ids)}
+    return {name.rsplit("_", 1)[0] for name in goals | set(task.states)}
+
+
+def _digest() -> str:
+    """Hash of everything that decides what the simulator does."""
+    digest = hashlib.sha256()
+    root = Path(sim.__file__).parent
+    for path in sorted(p for p in root.rglob("*") if p.suffix in (".py", ".yaml", ".xml", ".csv", ".stl")):
+        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    """Command line; returns the exit code: 0, 1 when the files differ or slots stay empty, 2 for unknown arguments."""
+    parser = argparse.ArgumentParser(prog="python -m sim.tasks.generate", description="Generates, or checks, the benchmark.")
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument("--check", action="store_true", help="solve every task again and compare the files")
+    group.add_argument("--check-fast", action="store_true", help="draw every task again and compare the files")
+    group.add_argument("--table", action="store_true", help="print the certificates per family and robot")
+    parser.add_argument("--workers", type=int, default=2, help="processes")
+    parser.add_argument("--tried", type=Path, default=None, help="folder of what has been tried; outputs/tasks/HASH by default")
+    options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    if words in (["--check"], ["--check-fast"]):
-        problems = _check(solve=words == ["--check"])
-        for name, problem in problems.items():
-            sys.stderr.write(f"{name}: {problem}\n")
+    if options.table:
+        sys.stdout.write(certificates_table(load_benchmark(), load_certificates()))
+        return 0
+    if options.check or options.check_fast:
+        problems = list(_check(solve=options.check))
+        sys.stdout.write(json.dumps(counts(load_benchmark())) + "\n")
+        for problem in problems:
+            sys.stderr.write(problem + "\n")
         return int(bool(problems))
-    if words:
-        sys.stderr.write(f"unknown arguments {words}; allowed: --check, --check-fast\n")
-        return 2
-    tasks, certificates = generate()
+    try:
+        tasks, certificates = generate(options.tried or Path("outputs/tasks") / _digest(), options.workers)
+    except RuntimeError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
     write_tasks(tasks, BENCHMARK_PATH)
-    write_text(CERTIFICATES_PATH, _certificates_text(certificates))
-    sys.stdout.write(f"{len(tasks)} tasks, {len(certificates)} certificates\n")
+    write_text(CERTIFICATES_PATH, certificates_text(certificates))
+    sys.stdout.write(json.dumps(counts(tasks)) + "\n")
     return 0
 
 

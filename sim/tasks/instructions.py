@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-__all__ = ["TEMPLATES", "natural_name", "phrase", "preposition", "shuffled", "wordings"]
+__all__ = ["TEMPLATES", "natural_name", "phrase", "plural", "preposition", "shuffled", "wordings"]
 
 _SPECIAL: Final[Mapping[str, str]] = {
     "TVStand": "TV stand",
@@ -32,7 +32,21 @@ _SPECIAL: Final[Mapping[str, str]] = {
 _ORDINALS: Final = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth")
 
 _ENCLOSING: Final = frozenset(
-    ("Box", "Bowl", "Cabinet", "Cup", "Drawer", "Fridge", "GarbageCan", "LaundryHamper", "Microwave", "Mug", "Pot", "SinkBasin")
+    (
+        "BathtubBasin",
+        "Box",
+        "Bowl",
+        "Cabinet",
+        "Cup",
+        "Drawer",
+        "Fridge",
+        "GarbageCan",
+        "LaundryHamper",
+        "Microwave",
+        "Mug",
+        "Pot",
+        "SinkBasin",
+    )
 )
 
 #: Sentence templates by family. Slots: a, b objects; r, s receptacles; pr, ps their prepositions (`on` or `in`).
@@ -113,11 +127,121 @@ TEMPLATES: Final[Mapping[str, tuple[str, ...]]] = {
         "Grab {a} and leave {b} open.",
         "Have {a} in your hand and {b} open.",
     ),
+    "place_any": (
+        "Put {n} {pr} {r}.",
+        "Bring {n} to {r}.",
+        "There should be {n} {pr} {r}.",
+        "Place {n} {pr} {r}, any one will do.",
+        "Get {n} from somewhere and set it {pr} {r}.",
+    ),
+    "transport_any_two": (
+        "Put {n} {pr} {r}.",
+        "Bring {n} to {r}.",
+        "There should be {n} {pr} {r}.",
+        "Place {n} {pr} {r}, any of them will do.",
+    ),
+    "fill": (
+        "Fill {a} with water.",
+        "Fill {a} at {r}.",
+        "Put some water in {a}.",
+        "{a} should be full of water.",
+        "Take {a} to {r} and fill it.",
+    ),
+    "slice": (
+        "Slice {a} with {b}.",
+        "Cut {a} with {b}.",
+        "Take {b} and slice {a}.",
+        "Use {b} to cut {a} into slices.",
+    ),
+    "clean": (
+        "Clean {a} with {b}.",
+        "{a} is dirty, wipe it with {b}.",
+        "Take {b} and clean {a}.",
+        "Use {b} to get {a} clean.",
+    ),
+    "cook": (
+        "Cook {a} in {r}.",
+        "Heat {a} in {r} until it is done.",
+        "Put {a} in {r} and cook it.",
+        "Use {r} to cook {a}.",
+    ),
+    "use_up": (
+        "Use up {a}.",
+        "Take all that is left of {a}.",
+        "Finish {a}.",
+        "Nothing of {a} should be left, use it up.",
+    ),
+    "fetch_two": (
+        "Take {a} and {b} out of {s} and put them {pr} {r}.",
+        "Get {a} and {b} from {s} and set them {pr} {r}.",
+        "{a} and {b} are in {s}, move them to {r}.",
+        "Fetch {a} and {b} from inside {s} and place both {pr} {r}.",
+    ),
+    "stow_two": (
+        "Put {a} and {b} in {r}, which is closed.",
+        "Open {r} and put {a} and {b} in it.",
+        "Stow {a} and {b} inside {r}.",
+        "{a} and {b} belong inside {r}, put them there.",
+    ),
+    "stow_two_close": (
+        "Put {a} and {b} in {r} and close it.",
+        "Stow {a} and {b} inside {r} and shut it again.",
+        "Store {a} and {b} in {r}, then close {r}.",
+        "{a} and {b} belong inside {r}, put them there and leave {r} closed.",
+    ),
+    "set_three": (
+        "Put {a}, {b} and {c} {pr} {r}.",
+        "Bring {a}, {b} and {c} to {r}.",
+        "{a}, {b} and {c} belong {pr} {r}.",
+        "Set out {a}, {b} and {c} {pr} {r}.",
+    ),
+    "tidy_three": (
+        "Tidy up: {a} and {b} go {pr} {r}, {c} goes {ps} {s}.",
+        "Put {a} and {b} {pr} {r}, and {c} {ps} {s}.",
+        "{a} and {b} belong {pr} {r}, {c} belongs {ps} {s}.",
+        "Bring {a} and {b} to {r} and {c} to {s}.",
+    ),
+    "carry_level": (
+        "Carry {a} to {r} without spilling.",
+        "{a} is full, set it down {pr} {r} and spill nothing.",
+        "Move {a} to {r} with both hands and keep it level.",
+        "Put the full pot, {a}, {pr} {r} without losing its water.",
+    ),
+    "store_ajar": (
+        "Put {a} in {r}, which falls shut when nothing holds it open.",
+        "Hold {r} open with one hand and put {a} in it, then let it fall shut.",
+        "{r} closes by itself: keep it open while you put {a} inside.",
+        "Store {a} in {r}; it does not stay open by itself, and should be closed afterwards.",
+    ),
+    "fetch_ajar": (
+        "Take {a} out of {s}, which falls shut when nothing holds it open.",
+        "Hold {s} open with one hand, take {a} out, then let it fall shut.",
+        "{s} closes by itself: keep it open while you take {a} out.",
+        "Get {a} from {s}; it does not stay open by itself, and should be closed afterwards.",
+    ),
+    "slice_steady": (
+        "Slice {a} with {b}.",
+        "Hold {a} with one hand and cut it with {b}.",
+        "Cut {a} with {b}, it rolls away unless you hold it.",
+        "Use {b} to slice {a} while the other hand keeps it still.",
+    ),
+    "clean_steady": (
+        "Clean {a} with {b}.",
+        "Hold {a} with one hand and wipe it with {b}.",
+        "{a} is dirty, wipe it with {b} and hold it still meanwhile.",
+        "Use {b} to clean {a} while the other hand keeps it still.",
+    ),
+    "pour_hold": (
+        "Fill {a} from {b}, then have both in your hands.",
+        "Pour from {b} into {a} and hold both of them at the end.",
+        "Take {b}, fill {a} from it, and take {a} in the other hand.",
+        "Have {a}, filled from {b}, in one hand and {b} in the other.",
+    ),
     "toggle_both": (
-        "Turn on {a} and {b}.",
-        "Switch on both {a} and {b}.",
-        "Make sure that {a} and {b} are running.",
-        "Please turn {a} on, and {b} too.",
+        "Turn {on} {a} and {b}.",
+        "Switch {on} both {a} and {b}.",
+        "Make sure that {a} and {b} are {on}.",
+        "Please turn {a} {on}, and {b} too.",
     ),
     "fetch": (
         "Take {a} out of {s} and put it {pr} {r}.",
@@ -183,6 +307,17 @@ def natural_name(object_type: str) -> str:
     if object_type in _SPECIAL:
         return _SPECIAL[object_type]
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", object_type).lower()
+
+
+def plural(object_type: str, count: int) -> str:
+    """So many objects of a type, none of them in particular: `a mug`, `two mugs`."""
+    name = natural_name(object_type)
+    if count == 1:
+        return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
+    ending = "es" if name.endswith(("s", "x", "ch", "sh", "o")) else "s"
+    if name.endswith("knife"):
+        name, ending = name[:-2], "ves"
+    return f"{('two', 'three', 'four')[count - 2]} {name}{ending}"
 
 
 def preposition(object_id: str) -> str:

@@ -8,12 +8,18 @@ goal-condition success follows the usual definition (satisfied conditions over a
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
-__all__ = ["KINDS", "Predicate", "PredicateError", "goal_fraction", "goals_hold"]
+__all__ = ["ANY", "KINDS", "Predicate", "PredicateError", "goal_fraction", "goals_hold"]
 
-Kind = Literal["on", "in", "held", "lifted", "open", "closed", "toggled_on", "toggled_off", "and", "or", "not", "count"]
+Kind = Literal[
+    "on", "in", "held", "lifted", "open", "closed", "toggled_on", "toggled_off", "filled", "sliced", "cooked", "clean",
+    "used_up", "and", "or", "not", "count", "exists",
+]  # fmt: skip
+
+#: Stands for the object in the operand of `exists`.
+ANY: Final = "$"
 
 #: Arguments of every predicate kind.
 KINDS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -25,10 +31,29 @@ KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     "closed": ("object_id",),
     "toggled_on": ("object_id",),
     "toggled_off": ("object_id",),
+    "filled": ("object_id",),
+    "sliced": ("object_id",),
+    "cooked": ("object_id",),
+    "clean": ("object_id",),
+    "used_up": ("object_id",),
     "and": ("of",),
     "or": ("of",),
     "not": ("of",),
     "count": ("of", "at_least"),
+    "exists": ("object_type", "of", "at_least"),
+}
+
+#: State that a leaf asks for, by kind: its name in the metadata and the value.
+_STATES: Final[Mapping[str, tuple[str, bool]]] = {
+    "open": ("isOpen", True),
+    "closed": ("isOpen", False),
+    "toggled_on": ("isToggled", True),
+    "toggled_off": ("isToggled", False),
+    "filled": ("isFilledWithLiquid", True),
+    "sliced": ("isSliced", True),
+    "cooked": ("isCooked", True),
+    "clean": ("isDirty", False),
+    "used_up": ("isUsedUp", True),
 }
 
 
@@ -43,11 +68,13 @@ class Predicate:
     Attributes:
         kind: a key of `KINDS`. `on`: the receptacle (anything with a supporting surface) carries the object. `in`: the
             receptacle encloses it (same containment fact, for wording). `held`: some hand holds the object. `lifted`: both
-            hands hold it, clear of every receptacle.
+            hands hold it, clear of every receptacle. `exists`: the operand, with `$` in place of an object, is true of
+            `at_least` many objects of the type.
         object_id: object the predicate is about, for leaf kinds.
         receptacle_id: receptacle, for `on` and `in`.
-        of: operands of `and`, `or`, `not` (one) and `count`.
-        at_least: for `count`, how many operands must hold.
+        object_type: for `exists`, the objects that count.
+        of: operands of `and`, `or`, `not` (one), `count` and `exists` (one).
+        at_least: for `count`, how many operands must hold; for `exists`, how many objects.
 
     Raises:
         PredicateError: when arguments are missing or superfluous.
@@ -56,6 +83,7 @@ class Predicate:
     kind: Kind
     object_id: str = ""
     receptacle_id: str = ""
+    object_type: str = ""
     of: tuple[Predicate, ...] = ()
     at_least: int = 0
 
@@ -63,21 +91,46 @@ class Predicate:
         if self.kind not in KINDS:
             raise PredicateError(f"unknown predicate {self.kind!r}; allowed: {', '.join(KINDS)}")
         needed = KINDS[self.kind]
-        for name in ("object_id", "receptacle_id", "of", "at_least"):
+        for name in ("object_id", "receptacle_id", "object_type", "of", "at_least"):
             if bool(getattr(self, name)) != (name in needed):
                 need = "needs" if name in needed else "takes no"
                 raise PredicateError(f"{self.kind} {need} {name}, got {getattr(self, name)!r}; takes: {', '.join(needed)}")
-        if self.kind == "not" and len(self.of) != 1:
-            raise PredicateError(f"not takes one operand, got {len(self.of)}")
+        if self.kind in ("not", "exists") and len(self.of) != 1:
+            raise PredicateError(f"{self.kind} takes one operand, got {len(self.of)}")
+        if self.kind == "exists" and (self.at_least < 1 or not self.of[0]._is_open()):
+            raise PredicateError(f"exists needs at_least of 1 or more and {ANY!r} in its operand, got {self.to_json()}")
         if self.kind == "count" and not 0 < self.at_least <= len(self.of):
             raise PredicateError(f"count: at_least {self.at_least} outside 1..{len(self.of)}")
 
     def object_ids(self) -> tuple[str, ...]:
-        """Every object and receptacle that the predicate names, in order, without repeats."""
-        names = [name for name in (self.object_id, self.receptacle_id) if name]
+        """Every object and receptacle that the predicate names, in order, without repeats; `$` is none."""
+        names = [name for name in (self.object_id, self.receptacle_id) if name not in ("", ANY)]
         for operand in self.of:
             names.extend(operand.object_ids())
         return tuple(dict.fromkeys(names))
+
+    def involved(self, object_ids: Iterable[str]) -> tuple[str, ...]:
+        """As `object_ids`, with all objects that an `exists` may mean."""
+        known = tuple(object_ids)
+        operands = self.candidates(known) if self.kind == "exists" else self.of
+        return tuple(dict.fromkeys((*self.object_ids(), *(name for one in operands for name in one.involved(known)))))
+
+    def _is_open(self) -> bool:
+        """Whether `$` occurs in it."""
+        return ANY in (self.object_id, self.receptacle_id) or any(operand._is_open() for operand in self.of)
+
+    def about(self, object_id: str) -> Predicate:
+        """The predicate with an object in the place of `$`."""
+        names = {key: object_id if getattr(self, key) == ANY else getattr(self, key) for key in ("object_id", "receptacle_id")}
+        return replace(self, **names, of=tuple(operand.about(object_id) for operand in self.of))
+
+    def candidates(self, object_ids: Iterable[str]) -> tuple[Predicate, ...]:
+        """For `exists`, its operand about every object of the type, in the order of the ids."""
+        names = sorted(
+            (name for name in object_ids if name.rsplit("_", 1)[0] == self.object_type),
+            key=lambda name: int(name.rsplit("_", 1)[1]),
+        )
+        return tuple(self.of[0].about(name) for name in names)
 
     def holds(self, metadata: Mapping[str, Any]) -> bool:
         """Whether the predicate is true in `World.metadata()`.
@@ -97,6 +150,8 @@ class Predicate:
             if self.kind == "not":
                 return not values[0]
             return sum(values) >= self.at_least
+        if self.kind == "exists":
+            return sum(operand._holds(objects) for operand in self.candidates(objects)) >= self.at_least
         entry = objects.get(self.object_id)
         if entry is None:
             raise PredicateError(f"{self.kind}: no object {self.object_id!r} in the scene; it has {', '.join(sorted(objects))}")
@@ -108,11 +163,8 @@ class Predicate:
             return bool(entry["isPickedUp"])
         if self.kind == "lifted":
             return len(entry["heldBy"]) == 2 and not entry["parentReceptacles"]
-        if self.kind == "open":
-            return bool(entry["isOpen"])
-        if self.kind == "closed":
-            return not entry["isOpen"]
-        return bool(entry["isToggled"]) == (self.kind == "toggled_on")
+        name, value = _STATES[self.kind]
+        return bool(entry[name]) == value
 
     def to_json(self) -> dict[str, Any]:
         """Plain form with only the arguments that the kind takes, in a fixed order."""

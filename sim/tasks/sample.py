@@ -9,53 +9,69 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Mapping, Sequence
-from typing import Final
+from collections.abc import Callable, Sequence
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.catalogue import load_catalogue
-from sim.navigation import NavigationMap
+from sim.catalogue import ObjectType, load_catalogue
+from sim.navigation import NavigationMap, Rectangle
 from sim.placement import OVERHANG_SHARE, fits_on
 from sim.robots.build_solver import robot_kit
 from sim.robots.spec import load_robot
-from sim.rooms import load_room
+from sim.rooms import Furniture, load_room, room_names
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach_map import reach_maps
-from sim.tasks.drafts import FAMILIES, Draft, NoDraft, Scene, category_of, draw
+from sim.tasks.drafts import Draft, NoDraft, Scene
+from sim.tasks.families import CATEGORIES, FAMILIES, draw, family_of
 from sim.tasks.task import Placement, Start, Task
 from sim.world import World, WorldError
 
-__all__ = ["BENCHMARK_SEEDS", "ROBOTS", "ROOMS", "TRAIN_SEEDS", "rng_for", "sample_task", "scene_of", "settle", "typical_steps"]
+__all__ = [
+    "BENCHMARK_SEEDS",
+    "BIG_TYPES",
+    "ROBOTS",
+    "ROOMS",
+    "TRAIN_ROOMS",
+    "TRAIN_SEEDS",
+    "UNSEEN_TYPES",
+    "rng_for",
+    "sample_task",
+    "scene_of",
+    "settle",
+]
 
-ROOMS: Final = ("kitchen_1", "living_room_1")
+#: Rooms of the training tasks: of every kind one room is kept back.
+TRAIN_ROOMS: Final = ("kitchen_1", "kitchen_2", "living_room_1", "living_room_2", "bedroom_1", "bathroom_1")
+ROOMS: Final = room_names()
+#: Movable types that occur in no training task.
+UNSEEN_TYPES: Final = ("Kettle", "Tomato", "Pan", "WineBottle", "AlarmClock", "Vase", "HandTowel", "PepperShaker")
 ROBOTS: Final = ("h1", "x1")
 #: Seeds of the benchmark's draws; training seeds start where they end.
 BENCHMARK_SEEDS: Final = range(0, 100_000)
 TRAIN_SEEDS: Final = range(100_000, 2**31)
 
-#: Types that tasks move with one hand. Flat cutlery is left out: fingers of this size do not pick it up from a table.
-_SMALL_TYPES: Final = (
-    "Mug", "Cup", "Bowl", "Bottle", "Apple", "Tomato", "SaltShaker", "PepperShaker", "PaperTowelRoll", "SoapBottle", "Book",
-    "RemoteControl", "TissueBox",
+#: Types that tasks have carried with both hands.
+BIG_TYPES: Final = ("Box", "HousePlant", "Pot", "Toaster", "Microwave", "CoffeeMachine", "LaundryHamper", "GarbageCan")
+#: Those that stand with a short side to the front, because the shorter robot's arms do not get around the long one.
+_TURNED: Final = ("Pot", "Toaster")
+_SURFACE_TYPES: Final = (
+    "CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser", "TVStand", "Shelf", "Bed", "Sofa", "Chair",
 )  # fmt: skip
-#: Types that tasks carry with both hands.
-_BIG_TYPES: Final = ("Box", "HousePlant", "Pot")
-#: What a robot's two arms do not get around, whatever the furniture.
-_TOO_WIDE: Final[Mapping[str, tuple[str, ...]]] = {"x1": ("Pot",)}
-_SURFACE_TYPES: Final = ("CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser", "TVStand", "Shelf")
+#: What only serves as a place to put things.
+_PLACE_TYPES: Final = ("SinkBasin", "BathtubBasin", "GarbageCan", "StoveBurner", "Toilet")
 #: A television leaves no room for hands on its stand.
 _NO_TARGET_TYPES: Final = ("TVStand",)
+#: Targets with room for several things and hands.
+_ROOMY_TYPES: Final = (
+    "CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser", "Bed", "Sofa", "SinkBasin", "BathtubBasin",
+)  # fmt: skip
 _CONTAINER_TYPES: Final = ("Fridge", "Cabinet", "Drawer", "Microwave")
-_SWITCH_TYPES: Final = ("Faucet", "StoveKnob", "Microwave", "FloorLamp", "Television", "LightSwitch")
-
-#: Steps that a family usually takes; a training task's budget is drawn around it.
-_TYPICAL_STEPS: Final[Mapping[str, int]] = {
-    "pick": 4, "place": 8, "open": 3, "close": 3, "toggle_on": 3, "toggle_off": 3, "transport_two": 10, "transport_each": 14,
-    "pick_and_toggle_on": 7, "pick_and_toggle_off": 7, "pick_and_open": 7, "fetch": 9, "fetch_hold": 5, "stow": 9,
-    "stow_close": 11, "lift": 4, "carry": 7, "hold_two": 7, "carry_and_toggle": 10, "carry_and_place": 13,
-}  # fmt: skip
+_LID_TYPES: Final = ("Toilet",)
+_SWITCH_TYPES: Final = (
+    "Faucet", "StoveKnob", "Microwave", "FloorLamp", "Television", "LightSwitch", "CoffeeMachine", "Toaster",
+)  # fmt: skip
 _HEIGHT_GRID_M: Final = 0.05
 _START_CLEARANCE_M: Final = 0.05
 #: An object farther away than this, or farther off the heading, does not count as seen at the start.
@@ -67,17 +83,19 @@ _EDGE_BAND_M: Final = 0.16
 #: Free distance between two objects of a task: a hand fits between.
 _HAND_GAP_M: Final = 0.09
 _REACH_MARGIN_M: Final = 0.02
+#: A surface so near to a switch or handle, and another switch so near, serve the other hand at the same time.
+_NEAR_M: Final = 0.45
+_PAIR_M: Final = 0.7
+#: Least distance between a switch or handle and an object beside it.
+_BESIDE_M: Final = 0.2
+_SPOTS: Final = 6
+_SMALL_RADIUS_M: Final = 0.06
 
 
 def rng_for(*key: object) -> np.random.Generator:
     """A random stream named by its key (hashed, independent of the process)."""
     digest = hashlib.sha256("/".join(map(str, key)).encode()).digest()
     return np.random.default_rng(int.from_bytes(digest[:8], "little"))
-
-
-def typical_steps(family: str) -> int:
-    """Steps that a family usually takes."""
-    return _TYPICAL_STEPS[family]
 
 
 @functools.cache
@@ -91,17 +109,23 @@ def scene_of(room: str) -> Scene:
         return tuple(name for name in ids if kinds[name].name in types)
 
     surfaces, containers = of(_SURFACE_TYPES), of(_CONTAINER_TYPES)
-    targets = tuple(name for name in surfaces if kinds[name].name not in _NO_TARGET_TYPES)
+    targets = (*(name for name in surfaces if kinds[name].name not in _NO_TARGET_TYPES), *of(_PLACE_TYPES))
 
-    def table(types: Sequence[str], places: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    def table(wanted: Callable[[ObjectType], bool], places: Sequence[str]) -> dict[str, tuple[str, ...]]:
         rows: dict[str, tuple[str, ...]] = {}
-        for name in types:
-            kind = catalogue.get(name)
+        for kind in catalogue.types.values():
             fits = tuple(place for place in places if fits_on(kind, kinds[place]))
-            if layout.category in kind.rooms and fits:
-                rows[name] = fits
+            if wanted(kind) and layout.category in kind.rooms and fits:
+                rows[kind.name] = fits
         return rows
 
+    boxes = {item.id: _footprint(item, kinds[item.id]) for item in layout.furniture}
+    active, near = (*containers, *of(_SWITCH_TYPES)), {}
+    for name in active:
+        here = np.asarray(next(item.xy for item in layout.furniture if item.id == name))
+        gaps = {other: float(boxes[other].distance(here[None])[0]) for other in (*surfaces, *active) if other != name}
+        near[name] = tuple(other for other, gap in gaps.items() if gap <= (_NEAR_M if other in surfaces else _PAIR_M))
+    heaters = {furniture: switch for switch, furniture in layout.links.items() if kinds[furniture].has("heat_source")}
     return Scene(
         room=room,
         furniture=ids,
@@ -109,57 +133,76 @@ def scene_of(room: str) -> Scene:
         targets=targets,
         containers=containers,
         switches=of(_SWITCH_TYPES),
-        small=table(_SMALL_TYPES, (*surfaces, *containers)),
-        big=table(_BIG_TYPES, targets),
+        small=table(lambda kind: kind.pickupable, (*surfaces, *of(_PLACE_TYPES), *containers)),
+        big=table(_takes_two_hands, tuple(name for name in targets if name in surfaces)),
+        lids=of(_LID_TYPES),
+        basins={tap: basin for tap, basin in layout.links.items() if kinds[tap].name == "Faucet"},
+        heaters=heaters | {name: name for name in ids if kinds[name].name == "Microwave"},
+        near=near,
+        roomy=tuple(name for name in targets if kinds[name].name in _ROOMY_TYPES),
     )
+
+
+def _footprint(item: Furniture, kind: ObjectType) -> Rectangle:
+    """Rectangle on the floor below a piece of furniture."""
+    return Rectangle(item.xy, (kind.size[0] / 2.0, kind.size[1] / 2.0), float(np.deg2rad(item.yaw_deg)))
+
+
+def _takes_two_hands(kind: ObjectType) -> bool:
+    """Whether tasks have a type carried with both hands: what needs them and can stand on furniture, and pots when full."""
+    return kind.name in BIG_TYPES
 
 
 def sample_task(
     seed: int,
     room: str | None = None,
     family: str | None = None,
-    split: str = "train",
+    source: str = "train",
     robots: Sequence[str] = ROBOTS,
 ) -> Task:
     """A task drawn from a seed.
 
     Args:
-        seed: one of `TRAIN_SEEDS` or `BENCHMARK_SEEDS`, whichever belongs to the split.
-        room: one of `ROOMS`; drawn when None.
-        family: a name of `sim.tasks.drafts.FAMILIES`; drawn when None (category first, then family).
-        split: `train` or `benchmark`.
+        seed: one of `TRAIN_SEEDS` or `BENCHMARK_SEEDS`, whichever belongs to the source.
+        room: a room; drawn from those of the source when None.
+        family: a name of `sim.tasks.families.FAMILIES`; drawn when None (category and room once, the family until it fits).
+        source: `train` or `benchmark`. Training tasks keep to `TRAIN_ROOMS` and do without `UNSEEN_TYPES`.
         robots: robots that have to reach everything the task is about.
 
     Raises:
-        ValueError: when the seed belongs to another split, or nothing suitable was drawn.
+        ValueError: when the seed belongs to another source, or nothing suitable was drawn.
     """
-    seeds = {"train": TRAIN_SEEDS, "benchmark": BENCHMARK_SEEDS}.get(split)
+    seeds = {"train": TRAIN_SEEDS, "benchmark": BENCHMARK_SEEDS}.get(source)
     if seeds is None or seed not in seeds:
-        raise ValueError(f"seed {seed} is not a {split} seed; allowed: train {TRAIN_SEEDS}, benchmark {BENCHMARK_SEEDS}")
+        raise ValueError(f"seed {seed} is not a {source} seed; allowed: train {TRAIN_SEEDS}, benchmark {BENCHMARK_SEEDS}")
+    without = UNSEEN_TYPES if source == "train" else ()
+    fixed = rng_for("task", source, seed)
+    wanted = str(fixed.choice(TRAIN_ROOMS if source == "train" else ROOMS))
+    category = str(fixed.choice(CATEGORIES))
+    families = [name for name, kind in FAMILIES.items() if kind.category == category]
     for attempt in range(_ATTEMPTS):
-        rng = rng_for("task", split, seed, attempt)
-        where = room or str(rng.choice(ROOMS))
-        what = family or str(rng.choice(FAMILIES[str(rng.choice(list(FAMILIES)))]))
+        rng = rng_for("task", source, seed, attempt)
+        another = str(rng.choice(TRAIN_ROOMS if source == "train" else ROOMS))
+        where = room or (wanted if attempt < _ATTEMPTS // 2 else another)  # so that rooms and categories stay balanced
+        what = family or str(rng.choice(families))
         try:
-            draft = draw(what, scene_of(where), rng)
-            return settle(draft, f"{split}_{what}_{seed}", seed, split, rng, robots)
+            draft = draw(what, scene_of(where), rng, without=without)
+            return settle(draft, f"{source}_{what}_{seed}", seed, source, rng, robots)
         except (NoDraft, WorldError):
             if room is not None and family is not None and attempt == _ATTEMPTS - 1:
                 raise
     raise ValueError(f"no task of family {family!r} in room {room!r} from seed {seed} in {_ATTEMPTS} attempts")
 
 
-def settle(draft: Draft, task_id: str, seed: int, split: str, rng: np.random.Generator, robots: Sequence[str] = ROBOTS) -> Task:
+def settle(
+    draft: Draft, task_id: str, seed: int, source: str, rng: np.random.Generator, robots: Sequence[str] = ROBOTS
+) -> Task:
     """Gives a draft positions, a start, words and a budget.
 
     Raises:
         WorldError: when the objects do not fit, or one of the robots cannot reach what it has to touch from anywhere.
     """
     scene = scene_of(draft.room)
-    for name in robots:
-        wide = [item for item in draft.objects if item.rsplit("_", 1)[0] in _TOO_WIDE.get(name, ())]
-        if wide:
-            raise WorldError(f"{name} does not get around {wide[0]}")
     empty = _empty_world(draft.room)
     spots = _spots(empty, draft, rng)
     placements = tuple(
@@ -170,22 +213,27 @@ def settle(draft: Draft, task_id: str, seed: int, split: str, rng: np.random.Gen
         for name, carrier in draft.objects.items()
     )  # fmt: skip
     world = World(None, draft.room, placements, states=draft.states, seed=seed % 2**31, settle_s=0.05)
-    points = {name: _hand_point(world, name, draft) for name in draft.focus.values()}
+    points = {name: _hand_points(world, name, draft, rng) for name in draft.focus.values()}
     for name in robots:
         navigation = navigation_map(world, load_robot(name).footprint_radius_m)
-        for object_id, point in points.items():
-            if point is not None and not _in_reach(name, navigation, point):
-                raise WorldError(f"{name} does not reach {object_id} at {point.round(2)} in {draft.room}")
+        for object_id, choices in points.items():
+            if not any(_in_reach(name, navigation, point) for point in choices):
+                where = choices[0].round(2) if choices else "its spots, which are taken,"
+                raise WorldError(f"{name} does not reach {object_id} at {where} in {draft.room}")
     positions = {name: world.center(name)[:2] for name in world.objects}
-    radius = max(load_robot(name).footprint_radius_m for name in robots)
-    start = _draw_start(navigation_map(world, radius + _START_CLEARANCE_M), positions[draft.focus["a"]], rng)
+    if source == "train":
+        radius = max(load_robot(name).footprint_radius_m for name in robots)
+        first = next(iter(draft.objects)) if "a" not in draft.focus else draft.focus["a"]
+        start = _draw_start(navigation_map(world, radius + _START_CLEARANCE_M), positions[first], rng)
+    else:
+        start = room_start(draft.room)
     hidden = [name for name, carrier in draft.objects.items() if not _in_view(start, positions[name], draft, carrier)]
     sentences = draft.sentences(scene.furniture, rng, hidden)
-    typical = _TYPICAL_STEPS[draft.family]
+    family = family_of(draft.family)
     return Task(
         id=task_id,
         room=draft.room,
-        category=category_of(draft.family),  # type: ignore[arg-type]
+        category=family.category,
         family=draft.family,
         instruction=sentences[0],
         paraphrases=sentences[1:4],
@@ -193,10 +241,25 @@ def settle(draft: Draft, task_id: str, seed: int, split: str, rng: np.random.Gen
         placements=placements,
         states=draft.states,
         goals=tuple(draft.goals),
-        step_budget=int(np.ceil(1.5 * typical)) + 2,
-        split=split,  # type: ignore[arg-type]
+        step_budget=int(np.ceil(1.5 * family.steps)) + 2,
+        split="train" if source == "train" else _novelty(draft),
         seed=seed,
     )
+
+
+def _novelty(draft: Draft) -> Literal["seen", "unseen"]:
+    """Whether the room, or an object that the task is about, occurs in no training task."""
+    named = {name for goal in draft.goals for name in goal.involved(draft.objects)} | set(draft.focus.values())
+    kinds = {name.rsplit("_", 1)[0] for name in named}
+    return "unseen" if draft.room not in TRAIN_ROOMS or kinds & set(UNSEEN_TYPES) else "seen"
+
+
+@functools.cache
+def room_start(room: str) -> Start:
+    """Where every benchmark task of a room starts: fixed within a room, heights vary between rooms."""
+    x, y, yaw_deg = load_room(room).start
+    share = float(rng_for("start", room).choice((0.0, 0.5, 1.0)))
+    return Start(x, y, yaw_deg, {name: start_height_m(name, share) for name in ROBOTS})
 
 
 @functools.cache
@@ -213,38 +276,50 @@ def _spots(empty: World, draft: Draft, rng: np.random.Generator) -> dict[str, ND
     catalogue = load_catalogue()
     spots: dict[str, NDArray[np.float64]] = {}
     taken: list[tuple[NDArray[np.float64], float, str]] = []
+    spots_gap = 0.0
     for name, carrier in draft.objects.items():
         kind = catalogue.get(name.rsplit("_", 1)[0])
-        radius, narrow = float(np.hypot(kind.size[0], kind.size[1])) / 2.0, min(kind.size[0], kind.size[1]) / 2.0
-        if kind.name in _BIG_TYPES:
+        radius, depth = float(np.hypot(kind.size[0], kind.size[1])) / 2.0, min(kind.size[0], kind.size[1])
+        narrow = (max(kind.size[0], kind.size[1]) if kind.name in _TURNED else depth) / 2.0
+        if kind.name in BIG_TYPES:
             narrow *= OVERHANG_SHARE
-        band = narrow + 0.06 if kind.name in _BIG_TYPES else max(_EDGE_BAND_M, narrow + 0.05)
+        band = narrow + 0.06 if kind.name in BIG_TYPES else max(_EDGE_BAND_M, narrow + 0.05)
         thing = empty.object(carrier)
         was_open, thing.openness = thing.openness, 1.0
+        other = draft.beside.get(name)
+        anchor = None if other is None else spots[other][:2] if other in spots else empty.pose(other)[:2, 3]
         for _ in range(12):
             spot = empty.free_spot(carrier, narrow, height_m=kind.size[2], rng=rng, band_m=band, gap_m=0.04)
-            if spot is not None and all(
-                other != carrier or float(np.linalg.norm(spot[:2] - place)) > radius + size + _HAND_GAP_M
-                for place, size, other in taken
+            if spot is None or any(
+                there == carrier and float(np.linalg.norm(spot[:2] - place)) <= radius + size + _HAND_GAP_M
+                for place, size, there in taken
             ):
-                spots[name] = spot
-                taken.append((spot[:2], radius, carrier))
+                continue
+            gap = 0.0 if anchor is None else float(np.linalg.norm(spot[:2] - anchor))
+            if name not in spots or (anchor is not None and _BESIDE_M + radius < gap < spots_gap):
+                spots[name], spots_gap = spot, gap
+            if anchor is None:
                 break
         thing.openness = was_open
+        if name in spots:
+            taken.append((spots[name][:2], radius, carrier))
         if name not in spots:
             raise WorldError(f"no room for {name} on {carrier} in {draft.room}")
     return spots
 
 
-def _hand_point(world: World, object_id: str, draft: Draft) -> NDArray[np.float64] | None:
-    """Where a hand has to get to for an object of the task, None for surfaces, which offer many points."""
+def _hand_points(world: World, object_id: str, draft: Draft, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+    """Where a hand has to get to for an object of the task: one of these points will do."""
     thing = world.object(object_id)
     goal = next((goal for goal in draft.goals if goal.object_id == object_id), None)
-    if thing.movable:
-        return world.center(object_id)
+    if thing.movable and not (thing.moving and goal is not None and goal.kind in ("open", "closed")):
+        return [world.center(object_id)]
     if goal is not None and goal.kind.startswith("toggled"):
-        return world.toggle_point(object_id)
-    return world.handle(object_id) if thing.moving else None
+        return [world.toggle_point(object_id)]
+    if thing.moving:
+        return [world.handle(object_id)]
+    spots = [world.free_spot(object_id, _SMALL_RADIUS_M, rng=rng, band_m=_EDGE_BAND_M) for _ in range(_SPOTS)]
+    return [spot + (0.0, 0.0, 0.05) for spot in spots if spot is not None]
 
 
 @functools.cache
@@ -272,11 +347,12 @@ def _in_reach(robot: str, navigation: NavigationMap, point: NDArray[np.float64])
 
 
 def _yaw_deg(rng: np.random.Generator, empty: World, name: str, carrier: str) -> float:
-    """Small objects stand roughly square to the furniture; big ones with their long side along its front, within reach."""
+    """Small objects stand roughly square to the furniture; big ones square to it, within reach."""
     rotation = empty.pose(carrier)[:2, :2]
     along = float(np.rad2deg(np.arctan2(rotation[1, 0], rotation[0, 0])))
-    if name.rsplit("_", 1)[0] in _BIG_TYPES:
-        return along
+    kind = name.rsplit("_", 1)[0]
+    if kind in BIG_TYPES:
+        return along + (90.0 if kind in _TURNED else 0.0)
     return along + float(rng.choice((0.0, 90.0, 180.0, 270.0))) + float(rng.integers(-3, 4)) * 5.0
 
 

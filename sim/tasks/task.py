@@ -100,7 +100,8 @@ class Task:
         states: start states of the room's own objects by id, for example `{"Fridge_1": {"isOpen": true}}`.
         goals: predicates that must all hold.
         step_budget: plan steps allowed, 1..50, the same for every robot.
-        split: `benchmark` or `train`.
+        split: `train`; of the benchmark's tasks `seen`, or `unseen` when the room or an object that the task names occurs in no
+            training task.
         seed: seed the task was drawn with, also the world's seed.
 
     Raises:
@@ -116,7 +117,7 @@ class Task:
     placements: tuple[Placement, ...]
     goals: tuple[Predicate, ...]
     step_budget: int
-    split: Literal["benchmark", "train"]
+    split: Literal["seen", "unseen", "train"]
     seed: int
     paraphrases: tuple[str, ...] = ()
     states: Mapping[str, Mapping[str, bool | float | str]] = field(default_factory=dict)

@@ -96,7 +96,7 @@ class ScriptedPlanner:
         return parse_reply(self.texts[number] if number < len(self.texts) else "Done()", tokens=10, latency_s=0.001)
 
 
-def make_task(name: str = "a", category: str = "single", budget: int = 6, split: str = "benchmark") -> Task:
+def make_task(name: str = "a", category: str = "single", budget: int = 6, split: str = "seen") -> Task:
     return Task(
         id=name,
         room="kitchen_1",

@@ -102,9 +102,9 @@ def test_selection_refuses_what_is_not_there(cfg) -> None:
 
 def test_split_takes_the_tasks_of_a_split_and_names_those_there_are(cfg, task) -> None:
     assert len(select_tasks(dataclasses.replace(cfg, split="all"))) == 4
-    for split in ("seen", "unseen"):
-        with pytest.raises(ValueError, match=f"no task of split '{split}'; its tasks are of: benchmark"):
-            select_tasks(dataclasses.replace(cfg, split=split))
+    assert len(select_tasks(dataclasses.replace(cfg, split="seen"))) == 4
+    with pytest.raises(ValueError, match="no task of split 'unseen'; its tasks are of: seen"):
+        select_tasks(dataclasses.replace(cfg, split="unseen"))
     assert "unseen" in run_folder(dataclasses.replace(cfg, split="unseen"), "").name
 
 

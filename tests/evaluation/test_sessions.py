@@ -30,7 +30,7 @@ TASK = Task(
     placements=(Placement("Mug_1", "Mug", "CoffeeTable_1"),),
     goals=(Predicate("held", "Mug_1"),),
     step_budget=3,
-    split="benchmark",
+    split="seen",
     seed=4,
 )
 

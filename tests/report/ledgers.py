@@ -31,7 +31,7 @@ LAMP = Task(
     placements=(Placement("Mug_1", "Mug", "CoffeeTable_1"),),
     goals=(Predicate("held", "Mug_1"), Predicate("not", of=(Predicate("open", "Drawer_1"),))),
     step_budget=6,
-    split="benchmark",
+    split="seen",
     seed=4,
 )
 
@@ -47,7 +47,7 @@ PLANT = Task(
     placements=(Placement("HousePlant_1", "HousePlant", "DiningTable_1", (2.29, -0.83)),),
     goals=(Predicate("lifted", "HousePlant_1"), Predicate("not", of=(Predicate("open", "Fridge_1"),))),
     step_budget=7,
-    split="benchmark",
+    split="seen",
     seed=21001,
 )
 PLANT_REPLIES = ("GoTo(HousePlant_1)", HOSTILE, "Lift(HousePlant_1)", "MoveUp(0.05)", "Lift(HousePlant_1)")

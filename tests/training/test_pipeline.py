@@ -339,11 +339,11 @@ def test_rollouts_refuse_the_benchmark(tmp_path: Path) -> None:
     assert rollouts[0].view(3).image.shape == (112, 112, 3)
     with pytest.raises(ValueError, match="3 steps need 4 observations, got 0"):
         rollout_row("e", "t", "single", "k", 0, "easy", [], STEPS, True)
-    row = {**rollouts[0].row, "split": "benchmark"}
+    row = {**rollouts[0].row, "split": "seen"}
     writer = ShardWriter(tmp_path / "leak", "rollouts", "h")
     writer.write(0, [row])
     writer.finish({})
-    with pytest.raises(ValueError, match="'e0' is of the benchmark"):
+    with pytest.raises(ValueError, match="'e0' is of split 'seen'"):
         read_rollouts(tmp_path / "leak")
 
 

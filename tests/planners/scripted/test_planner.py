@@ -238,5 +238,5 @@ def test_an_episode_succeeds(robot: str) -> None:
 
     record = run_episode(session, planner, fields, task.instruction, task.step_budget, 0)  # type: ignore[arg-type]
     assert record.outcome is Outcome.SUCCESS, record.message or record.trace
-    assert record.steps == 2
+    assert record.steps <= task.step_budget
     assert record.invalid_output == 0

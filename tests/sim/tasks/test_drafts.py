@@ -3,24 +3,32 @@
 import numpy as np
 import pytest
 
-from sim.tasks.drafts import FAMILIES, NoDraft, Scene, category_of, draw
+from sim.tasks.drafts import NoDraft, Scene
+from sim.tasks.families import CATEGORIES, FAMILIES, draw, family_of
 
+SURFACES = ("CounterTop_1", "DiningTable_1", "SideTable_1", "CounterTop_2")
+CONTAINERS = ("Fridge_1", "Drawer_1", "Microwave_1")
 SCENE = Scene(
     room="test_room",
-    furniture=("CounterTop_1", "DiningTable_1", "SideTable_1", "Fridge_1", "Faucet_1"),
-    surfaces=("CounterTop_1", "DiningTable_1", "SideTable_1"),
-    targets=("CounterTop_1", "DiningTable_1", "SideTable_1"),
-    containers=("Fridge_1",),
-    switches=("Faucet_1",),
+    furniture=(*SURFACES, *CONTAINERS, "Faucet_1", "SinkBasin_1", "Toilet_1", "StoveKnob_1", "StoveKnob_2"),
+    surfaces=SURFACES,
+    targets=SURFACES,
+    containers=CONTAINERS,
+    switches=("Faucet_1", "StoveKnob_1", "StoveKnob_2"),
     small=dict.fromkeys(
-        ("Mug", "Apple", "Bowl", "Bottle", "Egg"), ("CounterTop_1", "DiningTable_1", "SideTable_1", "Fridge_1")
+        ("Mug", "Apple", "Bowl", "Bottle", "Egg", "Bread", "Potato", "Knife", "DishSponge", "TissueBox", "Book", "DeskLamp"),
+        (*SURFACES, *CONTAINERS),
     ),
-    big={"Box": ("DiningTable_1", "SideTable_1")},
+    big={"Box": ("DiningTable_1", "SideTable_1"), "Pot": ("DiningTable_1", "CounterTop_1")},
+    lids=("Toilet_1",),
+    basins={"Faucet_1": "SinkBasin_1"},
+    heaters={"Microwave_1": "Microwave_1"},
+    near={"Faucet_1": ("CounterTop_1",), "Microwave_1": ("CounterTop_2",), "StoveKnob_1": ("StoveKnob_2",)},
+    roomy=SURFACES,
 )
-ALL = [family for families in FAMILIES.values() for family in families]
 
 
-@pytest.mark.parametrize("family", ALL)
+@pytest.mark.parametrize("family", FAMILIES)
 def test_drafts_are_legal_and_seeded(family):
     for seed in range(20):
         draft = draw(family, SCENE, np.random.default_rng(seed))
@@ -31,13 +39,15 @@ def test_drafts_are_legal_and_seeded(family):
             assert carrier in fits
         everything = set(draft.objects) | set(SCENE.furniture)
         for goal in draft.goals:
-            assert set(goal.object_ids()) <= everything
+            assert set(goal.involved(everything)) <= everything
             if goal.kind in ("on", "in"):
                 assert draft.objects[goal.object_id] != goal.receptacle_id
         assert set(draft.focus.values()) <= everything
+        assert set(draft.beside) <= set(draft.objects)
+        assert set(draft.beside.values()) <= everything
 
 
-@pytest.mark.parametrize("family", ALL)
+@pytest.mark.parametrize("family", FAMILIES)
 def test_sentences_name_where_hidden_objects_are(family):
     draft = draw(family, SCENE, np.random.default_rng(1), distractors=(0, 0))
     sentences = draft.sentences(SCENE.furniture, np.random.default_rng(0), hidden=tuple(draft.objects))
@@ -47,10 +57,17 @@ def test_sentences_name_where_hidden_objects_are(family):
     assert all((" from " in sentence) for sentence in sentences) or not hidden
 
 
+def test_types_that_are_left_out_do_not_occur():
+    for seed in range(20):
+        draft = draw("transport_two", SCENE, np.random.default_rng(seed), without=("Mug", "Apple"))
+        assert not {name.rsplit("_", 1)[0] for name in draft.objects} & {"Mug", "Apple"}
+
+
 def test_categories():
-    assert category_of("stow_close") == "optional"
+    assert {family.category for family in FAMILIES.values()} == set(CATEGORIES)
+    assert family_of("stow_close").category == "optional"
     with pytest.raises(KeyError, match="juggle"):
-        category_of("juggle")
+        family_of("juggle")
 
 
 def test_a_room_without_switches_cannot_offer_toggling():
@@ -59,3 +76,5 @@ def test_a_room_without_switches_cannot_offer_toggling():
         draw("toggle_on", bare, np.random.default_rng(0))
     with pytest.raises(NoDraft, match="lift"):
         draw("lift", bare, np.random.default_rng(0))
+    with pytest.raises(NoDraft, match="pair of switches for toggle_both"):
+        draw("toggle_both", bare, np.random.default_rng(0))

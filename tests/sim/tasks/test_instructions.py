@@ -6,7 +6,7 @@ import string
 import numpy as np
 import pytest
 
-from sim.tasks.instructions import TEMPLATES, natural_name, phrase, preposition, shuffled, wordings
+from sim.tasks.instructions import TEMPLATES, natural_name, phrase, plural, preposition, shuffled, wordings
 
 SCENE = {
     "Cabinet_1": None,
@@ -68,10 +68,12 @@ def test_prepositions():
 
 @pytest.mark.parametrize("family", TEMPLATES)
 def test_every_family_has_four_wordings_that_use_every_object(family):
-    slots = {name: f"the {name}{name}" for name in ("a", "b", "r", "s")} | {"pr": "on", "ps": "in"}
+    slots = {name: f"the {name}{name}" for name in ("a", "b", "c", "r", "s")}
+    slots |= {"pr": "on", "ps": "in", "n": "two mugs", "on": "on"}
     used = [{name for _, name, _, _ in string.Formatter().parse(template) if name} for template in TEMPLATES[family]]
     assert len(used) >= 4
-    assert all(names & {"a", "b", "r"} == used[0] & {"a", "b", "r"} for names in used)
+    objects = {"a", "b", "c", "n", "on"} | (set() if family == "fill" else {"r"})  # there is one tap: it need not be named
+    assert all(names & objects == used[0] & objects for names in used)
     for sentence in wordings(family, slots):
         assert re.match(r"^[A-Z].*[.]$", sentence)
 
@@ -81,3 +83,12 @@ def test_shuffling_is_seeded():
     first = shuffled(sentences, np.random.default_rng(3))
     assert first == shuffled(sentences, np.random.default_rng(3))
     assert sorted(first) == list(sentences)
+
+
+@pytest.mark.parametrize(
+    ("object_type", "count", "words"),
+    [("Mug", 1, "a mug"), ("Apple", 1, "an apple"), ("Tomato", 2, "two tomatoes"), ("ButterKnife", 2, "two butter knives"),
+     ("Box", 3, "three boxes"), ("TissueBox", 2, "two tissue boxes")],
+)  # fmt: skip
+def test_some_of_a_type(object_type, count, words):
+    assert plural(object_type, count) == words

@@ -2,12 +2,13 @@
 
 import pytest
 
-from sim.tasks.predicates import Predicate, PredicateError, goal_fraction, goals_hold
+from sim.tasks.predicates import ANY, Predicate, PredicateError, goal_fraction, goals_hold
 
 
 def entry(object_id, on=(), held=(), **state):
     record = {"objectId": object_id, "parentReceptacles": list(on), "isPickedUp": bool(held), "heldBy": list(held)}
-    return record | {"isOpen": False, "isToggled": False} | state
+    states = ("isOpen", "isToggled", "isFilledWithLiquid", "isSliced", "isCooked", "isDirty", "isUsedUp")
+    return record | dict.fromkeys(states, False) | state
 
 
 METADATA = {
@@ -18,8 +19,12 @@ METADATA = {
         entry("Fridge_1", isOpen=True),
         entry("Lamp_1", isToggled=True),
         entry("Table_1"),
+        entry("Mug_2", on=["Table_1"], isFilledWithLiquid=True, isDirty=True),
+        entry("Potato_1", on=["Fridge_1"], isSliced=True, isCooked=True),
+        entry("Soap_1", isUsedUp=True),
     ]
 }
+ON_TABLE = Predicate("on", ANY, "Table_1")
 
 
 @pytest.mark.parametrize(
@@ -36,6 +41,23 @@ METADATA = {
         (Predicate("closed", "Table_1"), True),
         (Predicate("toggled_on", "Lamp_1"), True),
         (Predicate("toggled_off", "Lamp_1"), False),
+        (Predicate("filled", "Mug_2"), True),
+        (Predicate("filled", "Mug_1"), False),
+        (Predicate("clean", "Mug_2"), False),
+        (Predicate("clean", "Mug_1"), True),
+        (Predicate("sliced", "Potato_1"), True),
+        (Predicate("sliced", "Apple_1"), False),
+        (Predicate("cooked", "Potato_1"), True),
+        (Predicate("cooked", "Apple_1"), False),
+        (Predicate("used_up", "Soap_1"), True),
+        (Predicate("used_up", "Mug_1"), False),
+        (Predicate("exists", object_type="Mug", of=(ON_TABLE,), at_least=2), True),
+        (Predicate("exists", object_type="Mug", of=(ON_TABLE,), at_least=3), False),
+        (Predicate("exists", object_type="Fork", of=(ON_TABLE,), at_least=1), False),
+        (
+            Predicate("exists", object_type="Mug", of=(Predicate("and", of=(ON_TABLE, Predicate("clean", ANY))),), at_least=1),
+            True,
+        ),
         (Predicate("not", of=(Predicate("held", "Mug_1"),)), True),
         (Predicate("and", of=(Predicate("held", "Apple_1"), Predicate("open", "Fridge_1"))), True),
         (Predicate("or", of=(Predicate("held", "Mug_1"), Predicate("closed", "Fridge_1"))), False),
@@ -73,6 +95,9 @@ def test_json_has_only_the_arguments_of_the_kind():
         ({"kind": "held", "object_id": "Mug_1", "receptacle_id": "Table_1"}, "Table_1"),
         ({"kind": "not", "of": (Predicate("held", "A_1"), Predicate("held", "B_1"))}, "got 2"),
         ({"kind": "count", "of": (Predicate("held", "A_1"),), "at_least": 2}, "at_least 2"),
+        ({"kind": "exists", "object_type": "A", "of": (Predicate("held", "A_1"),), "at_least": 1}, "'A_1'"),
+        ({"kind": "exists", "object_type": "A", "of": (Predicate("held", "$"),)}, "at_least"),
+        ({"kind": "held", "object_id": "A_1", "object_type": "A"}, "object_type"),
     ],
 )
 def test_malformed_predicates_are_refused(arguments, message):
@@ -84,3 +109,11 @@ def test_malformed_predicates_are_refused(arguments, message):
 def test_unknown_objects_are_named(predicate):
     with pytest.raises(PredicateError, match="Ghost_1"):
         predicate.holds(METADATA)
+
+
+def test_an_exists_names_its_receptacle_and_involves_every_object_of_its_type():
+    goal = Predicate("exists", object_type="Mug", of=(ON_TABLE,), at_least=1)
+    assert goal.object_ids() == ("Table_1",)
+    assert set(goal.involved(["Mug_10", "Mug_2", "Table_1", "Mugger_1"])) == {"Table_1", "Mug_2", "Mug_10"}
+    assert [operand.object_id for operand in goal.candidates(["Mug_10", "Mug_2"])] == ["Mug_2", "Mug_10"]
+    assert goal.to_json() == {"kind": "exists", "object_type": "Mug", "of": [ON_TABLE.to_json()], "at_least": 1}
