@@ -22,7 +22,7 @@ from data.humanml3d import DatasetError, check_joints
 from data.motion import FPS, resample
 from data.skeleton import HumanMotion, index
 
-__all__ = ["find_demo_clips", "level_parts", "load_mocap", "load_omomo", "on_floor"]
+__all__ = ["demo_motions", "find_demo_clips", "level_parts", "load_mocap", "load_omomo", "on_floor"]
 
 Array = NDArray[np.float64]
 _OMOMO_FPS: Final = 30.0
@@ -48,6 +48,14 @@ def find_demo_clips() -> list[Path]:
     except ModuleNotFoundError:
         return []
     return [*sorted(root.glob("OMOMO_new/*.pt")), *sorted(root.glob("climb/*/*.npy"))]
+
+
+def demo_motions() -> list[HumanMotion]:
+    """The installed real clips that a robot on a level floor can follow: OMOMO's, and the level parts of the climbing ones."""
+    found: list[HumanMotion] = []
+    for path in find_demo_clips():
+        found += [load_omomo(path)] if path.suffix == ".pt" else level_parts(load_mocap(path))
+    return found
 
 
 def load_omomo(path: Path) -> HumanMotion:
