@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from data.script import Script
 
-__all__ = ["ACTIVITIES", "HEIGHTS", "RECIPES"]
+__all__ = ["ACTIVITIES", "DIRECTIONS", "HEIGHTS", "RECIPES"]
 
 Array = NDArray[np.float64]
 Phrases = list[str]
@@ -31,6 +31,12 @@ HEIGHTS: Final[Mapping[str, tuple[float, float]]] = {
     "at head height": (1.45, 1.6),
     "above the head": (1.7, 1.85),
 }
+#: Where a hand goes from the middle of the body: least and greatest x and, to its own side, y; metres.
+DIRECTIONS: Final[Mapping[str, tuple[tuple[float, float], tuple[float, float]]]] = {
+    "in front": ((0.32, 0.46), (0.08, 0.3)),
+    "to the side": ((0.12, 0.28), (0.42, 0.55)),
+    "across the body": ((0.28, 0.38), (-0.2, -0.05)),
+}
 _SIDES: Final = ("left", "right")
 
 
@@ -38,21 +44,48 @@ def _choice(script: Script, options: tuple[str, ...] | list[str]) -> str:
     return str(options[int(script.rng.integers(len(options)))])
 
 
-def _point(script: Script, side: int, height: str, width: float | None = None) -> Array:
+def _thing(script: Script, hands: int) -> str:
+    """What is handled: the same thing in all of a clip, and `the` after its first mention."""
+    one = ("a cup", "a bottle", "an object", "a small box", "a plate", "a book")
+    known = script.things.get(hands)
+    if known is not None:
+        return known
+    thing = _choice(script, one if hands == 1 else ("a box", "a heavy object", "a pot", "a basket", "a tray"))
+    script.things[hands] = f"the {thing.split(' ', 1)[1]}"
+    return thing
+
+
+def _point(script: Script, side: int, height: str, width: float | None = None, direction: str = "in front") -> Array:
     low, high = HEIGHTS[height]
-    x = 0.22 if height == "above the head" else float(script.rng.uniform(0.34, 0.44))
-    y = float(script.rng.uniform(0.1, 0.3)) if width is None else width
+    (x_low, x_high), (y_low, y_high) = DIRECTIONS[direction]
+    x = 0.22 if height == "above the head" else float(script.rng.uniform(x_low, x_high))
+    y = float(script.rng.uniform(y_low, y_high)) if width is None else width
     return np.array([x, y if side == 0 else -y, script.rng.uniform(low, high)])
 
 
+def _direction(script: Script, side: int, height: str) -> tuple[str, str]:
+    """A direction of `DIRECTIONS` and the words for it; low and high places are in front."""
+    if HEIGHTS[height][0] < 0.7 or HEIGHTS[height][1] > 1.7 or script.rng.random() < 0.5:
+        return "in front", ""
+    direction = _choice(script, ["to the side", "across the body"])
+    other = _SIDES[side] if direction == "to the side" else _SIDES[1 - side]
+    return direction, f" on the {other} side" if direction == "to the side" else f" across the body to the {other}"
+
+
 def _go(script: Script, wrists: dict[int, Array], seconds: float) -> None:
+    """Moves hands to points, with the trunk turned towards what is beside the body."""
     drop, lean = script.reach_posture(list(wrists.values()))
     for side, wrist in wrists.items():
         script.hand(side, wrist, seconds, advance=False)
+    if len(wrists) == 1:
+        (side, wrist), *_ = wrists.items()
+        beside = float(np.arctan2(wrist[1], max(wrist[0], 0.05))) - (0.45 if side == 0 else -0.45)
+        script.trunk(float(np.clip(0.45 * beside, -0.4, 0.4)), 0.0, seconds, advance=False)
     script.posture(drop, lean, seconds)
 
 
 def _stand(script: Script, seconds: float) -> None:
+    script.trunk(0.0, 0.0, seconds, advance=False)
     script.posture(0.0, 0.03, seconds)
 
 
@@ -116,15 +149,61 @@ def bend(script: Script) -> Phrases:
 
 
 def idle(script: Script) -> Phrases:
-    """Stands still."""
-    script.wait(float(script.rng.uniform(1.5, 3.0)))
-    return ["stands still", "waits without moving", "remains standing with the arms at the sides"]
+    """Stands and, half of the time, shifts the weight from one leg to the other."""
+    if script.rng.random() < 0.5:
+        script.wait(float(script.rng.uniform(1.5, 3.0)))
+        return ["stands still", "waits without moving", "remains standing with the arms at the sides"]
+    for side in (0, 1):
+        script.trunk(0.0, 0.09 if side else -0.09, float(script.rng.uniform(0.7, 1.1)))
+        script.wait(float(script.rng.uniform(0.1, 0.5)))
+    script.trunk(0.0, 0.0, 0.7)
+    return ["shifts the weight from one leg to the other", "stands and sways from side to side", "waits, swaying a little"]
+
+
+def look_around(script: Script) -> Phrases:
+    """Turns the chest to one side and, half of the time, to the other."""
+    side = int(script.rng.integers(2))
+    angle = float(script.rng.uniform(0.35, 0.7)) * (1.0 if side == 0 else -1.0)
+    script.trunk(angle, 0.0, float(script.rng.uniform(0.6, 1.0)))
+    script.wait(float(script.rng.uniform(0.2, 0.6)))
+    both = script.rng.random() < 0.5
+    if both:
+        script.trunk(-angle, 0.0, float(script.rng.uniform(0.9, 1.4)))
+        script.wait(float(script.rng.uniform(0.2, 0.6)))
+    script.trunk(0.0, 0.0, float(script.rng.uniform(0.6, 0.9)))
+    name, other = _SIDES[side], _SIDES[1 - side]
+    if both:
+        return [f"turns the upper body to the {name}, then to the {other}", f"looks to the {name} and to the {other}"]
+    return [f"turns the upper body to the {name} and back", f"looks over to the {name}", f"twists to the {name} and returns"]
+
+
+def gesture(script: Script) -> Phrases:
+    """Moves one or both hands from place to place in the air."""
+    sides = [(0,), (1,), (0, 1)][int(script.rng.integers(3))]
+    for _ in range(int(script.rng.integers(2, 5))):
+        seconds = float(script.rng.uniform(0.5, 1.1))
+        for side in sides:
+            x, y, z = script.rng.uniform((0.05, -0.05, 0.8), (0.45, 0.5, 1.75))
+            script.hand(side, np.array([x, y if side == 0 else -y, z]), seconds, advance=False)
+            script.elbow(side, float(script.rng.uniform(-0.1, 0.7)), seconds)
+            script.grip(side, float(script.rng.uniform(0.0, 1.0)), seconds)
+        script.trunk(float(script.rng.uniform(-0.25, 0.25)), float(script.rng.uniform(-0.08, 0.08)), seconds, advance=False)
+        script.posture(float(script.rng.uniform(0.0, 0.08)), float(script.rng.uniform(0.0, 0.2)), seconds)
+    for side in sides:
+        script.hand(side, None, 0.9, advance=False)
+        script.elbow(side, 0.0, 0.9)
+    _stand(script, 0.9)
+    if len(sides) == 2:
+        return ["gestures with both hands", "moves both arms about in the air", "talks with both hands moving"]
+    name = _SIDES[sides[0]]
+    return [f"gestures with the {name} hand", f"moves the {name} arm about in the air", f"talks, moving the {name} hand"]
 
 
 def reach(script: Script) -> Phrases:
     """Reaches out with one arm and takes the hand back."""
     side, height = int(script.rng.integers(2)), _choice(script, list(HEIGHTS))
-    wrists = {side: _point(script, side, height)}
+    direction, where = _direction(script, side, height)
+    wrists = {side: _point(script, side, height, direction=direction)}
     script.grip(side, 1.0)
     seconds = _slow(script, wrists)
     _go(script, wrists, seconds)
@@ -133,9 +212,10 @@ def reach(script: Script) -> Phrases:
     _stand(script, seconds)
     name = _SIDES[side]
     return [
-        f"reaches out with the {name} hand {height}",
-        f"extends the {name} arm {height} and brings it back",
-        f"stretches the {name} arm forward {height}",
+        f"reaches out with the {name} hand {height}{where}",
+        f"extends the {name} arm {height}{where} and brings it back",
+        f"stretches the {name} arm out {height}{where}",
+        f"uses the {name} hand to reach something {height}{where}",
     ]
 
 
@@ -163,7 +243,8 @@ def reach_both(script: Script) -> Phrases:
 def pick(script: Script) -> Phrases:
     """Picks something up with one hand and holds it."""
     side, height = int(script.rng.integers(2)), _choice(script, list(HEIGHTS)[:5])
-    wrists = {side: _point(script, side, height)}
+    direction, where = _direction(script, side, height)
+    wrists = {side: _point(script, side, height, direction=direction)}
     script.grip(side, 1.0)
     seconds = _slow(script, wrists)
     _go(script, wrists, seconds)
@@ -171,11 +252,12 @@ def pick(script: Script) -> Phrases:
     script.wait(0.35)
     script.hand(side, np.array([0.28, 0.2 if side == 0 else -0.2, 1.1]), seconds, advance=False)
     _stand(script, seconds)
-    name, thing = _SIDES[side], _choice(script, ("a cup", "a bottle", "an object", "a small box"))
+    name, thing = _SIDES[side], _thing(script, 1)
     return [
-        f"picks up {thing} {height} with the {name} hand",
-        f"grabs {thing} {height} using the {name} arm",
-        f"takes {thing} {height} in the {name} hand and holds it",
+        f"picks up {thing} {height}{where} with the {name} hand",
+        f"grabs {thing} {height}{where} using the {name} arm",
+        f"takes {thing} {height}{where} in the {name} hand and holds it",
+        f"uses the {name} hand to pick up {thing} {height}{where}",
     ]
 
 
@@ -184,18 +266,19 @@ def place(script: Script) -> Phrases:
     side, height = int(script.rng.integers(2)), _choice(script, list(HEIGHTS)[1:5])
     script.grip(side, 0.1)
     script.hand(side, np.array([0.28, 0.2 if side == 0 else -0.2, 1.1]), 0.7)
-    wrists = {side: _point(script, side, height)}
+    direction, where = _direction(script, side, height)
+    wrists = {side: _point(script, side, height, direction=direction)}
     seconds = _slow(script, wrists)
     _go(script, wrists, seconds)
     script.grip(side, 1.0)
     script.wait(0.35)
     script.hand(side, None, seconds, advance=False)
     _stand(script, seconds)
-    name, thing = _SIDES[side], _choice(script, ("a cup", "a plate", "an object", "a book"))
+    name, thing = _SIDES[side], _thing(script, 1)
     return [
-        f"puts down {thing} {height} with the {name} hand",
-        f"places {thing} {height} using the {name} arm",
-        f"sets {thing} down {height} with the {name} hand",
+        f"puts down {thing} {height}{where} with the {name} hand",
+        f"places {thing} {height}{where} using the {name} arm",
+        f"sets {thing} down {height}{where} with the {name} hand",
     ]
 
 
@@ -206,7 +289,7 @@ def carry(script: Script) -> Phrases:
         wrist = np.array([0.32, 0.16 if side == 0 else -0.16, 1.08])
         script.hand(side, wrist, 0.8, advance=side == 1)
     script.walk(float(script.rng.uniform(0.8, 1.8)), pace=0.9)
-    thing = _choice(script, ("a box", "a pot", "a tray"))
+    thing = _thing(script, 2)
     return [
         f"carries {thing} forward with both hands",
         f"walks ahead while holding {thing} in both hands",
@@ -229,7 +312,7 @@ def lift(script: Script) -> Phrases:
     for side in (0, 1):
         script.hand(side, np.array([0.33, left[1] if side == 0 else -left[1], 1.12]), seconds, advance=False)
     _stand(script, seconds)
-    thing = _choice(script, ("a box", "a heavy object", "a pot", "a basket"))
+    thing = _thing(script, 2)
     return [
         f"lifts {thing} {height} with both hands",
         f"picks up {thing} {height} using both arms",
@@ -298,6 +381,102 @@ def open_door(script: Script) -> Phrases:
     return [f"opens {thing} with the {name} hand", f"pulls {thing} open {height} with the {name} hand"]
 
 
+def close_door(script: Script) -> Phrases:
+    """Pushes a door shut along its arc."""
+    side = int(script.rng.integers(2))
+    sign = 1.0 if side == 0 else -1.0
+    height = _choice(script, ["at waist height", "at chest height"])
+    z = float(script.rng.uniform(*HEIGHTS[height]))
+    hinge, radius = np.array([0.5, 0.42 * sign]), 0.4
+    arc = [
+        np.array([hinge[0] - radius * np.sin(a), hinge[1] - sign * radius * np.cos(a), z]) for a in np.linspace(0.8, 0.05, 5)
+    ]
+    script.grip(side, 0.5)
+    _go(script, {side: arc[0]}, float(script.rng.uniform(0.8, 1.1)))
+    start, total = script.time_s, float(script.rng.uniform(0.9, 1.4))
+    script.hand_path(side, arc, total)
+    script.time_s = start + total
+    script.wait(0.2)
+    script.hand(side, None, 0.9, advance=False)
+    _stand(script, 0.9)
+    name, thing = _SIDES[side], _choice(script, ("a cabinet door", "a fridge", "a cupboard"))
+    return [f"closes {thing} with the {name} hand", f"pushes {thing} shut {height} with the {name} hand"]
+
+
+def pour(script: Script) -> Phrases:
+    """Holds a vessel over another one and tilts it with a raised elbow; the other hand steadies, half of the time."""
+    side = int(script.rng.integers(2))
+    sign = 1.0 if side == 0 else -1.0
+    level = float(script.rng.uniform(1.05, 1.2))
+    steady = script.rng.random() < 0.5
+    script.grip(side, 0.1)
+    if steady:
+        script.grip(1 - side, 0.2)
+        script.hand(1 - side, np.array([0.36, 0.06 * -sign, level - 0.12]), 0.9, advance=False)
+    script.hand(side, np.array([0.34, 0.2 * sign, level]), float(script.rng.uniform(0.8, 1.1)))
+    seconds = float(script.rng.uniform(0.7, 1.1))
+    script.elbow(side, float(script.rng.uniform(0.6, 1.0)), seconds)
+    script.hand(side, np.array([0.38, 0.05 * sign, level + 0.1]), seconds)
+    script.wait(float(script.rng.uniform(0.6, 1.4)))
+    script.elbow(side, 0.0, 0.7)
+    script.hand(side, np.array([0.32, 0.2 * sign, level]), 0.7)
+    for one in (0, 1) if steady else (side,):
+        script.hand(one, None, 0.9, advance=False)
+    _stand(script, 0.9)
+    name, thing = _SIDES[side], _choice(script, ("a bottle", "a kettle", "a jug"))
+    return [
+        f"pours something from {thing} with the {name} hand",
+        f"holds {thing} in the {name} hand and tilts it to pour",
+        f"fills a cup from {thing} using the {name} arm",
+    ]
+
+
+def wipe(script: Script) -> Phrases:
+    """Wipes a surface to and fro with one hand."""
+    side = int(script.rng.integers(2))
+    sign = 1.0 if side == 0 else -1.0
+    height = _choice(script, ["at knee height", "at waist height", "at waist height"])
+    centre = _point(script, side, height, 0.15)
+    script.grip(side, 0.3)
+    _go(script, {side: centre}, float(script.rng.uniform(0.9, 1.3)))
+    for _ in range(int(script.rng.integers(2, 5))):
+        for shift in (0.13, -0.13):
+            script.hand(side, centre + np.array([float(script.rng.uniform(-0.04, 0.04)), shift * sign, 0.0]), 0.35)
+    script.hand(side, None, 0.9, advance=False)
+    _stand(script, 0.9)
+    name, thing = _SIDES[side], _choice(script, ("a table", "a counter", "a surface"))
+    return [
+        f"wipes {thing} {height} with the {name} hand",
+        f"cleans {thing} with the {name} hand, moving it to and fro",
+        f"rubs over {thing} {height} using the {name} arm",
+    ]
+
+
+def put_down(script: Script) -> Phrases:
+    """Sets down with both hands what they hold."""
+    width = float(script.rng.uniform(0.12, 0.24))
+    for side in (0, 1):
+        script.grip(side, 0.3)
+        script.hand(side, np.array([0.32, width if side == 0 else -width, 1.1]), 0.8, advance=side == 1)
+    height = _choice(script, list(HEIGHTS)[:3])
+    left = _point(script, 0, height, width)
+    wrists = {0: left, 1: left * np.array([1.0, -1.0, 1.0])}
+    seconds = _slow(script, wrists)
+    _go(script, wrists, seconds)
+    for side in (0, 1):
+        script.grip(side, 0.9)
+    script.wait(0.35)
+    for side in (0, 1):
+        script.hand(side, None, seconds, advance=False)
+    _stand(script, seconds)
+    thing = _thing(script, 2)
+    return [
+        f"sets {thing} down {height} with both hands",
+        f"puts {thing} down {height} using both arms",
+        f"lowers {thing} with two hands and lets go of it {height}",
+    ]
+
+
 def wave(script: Script) -> Phrases:
     """Waves with a raised hand."""
     side = int(script.rng.integers(2))
@@ -331,6 +510,12 @@ ACTIVITIES: Final[Mapping[str, Activity]] = {
     "pull": pull,
     "open": open_door,
     "wave": wave,
+    "close": close_door,
+    "pour": pour,
+    "wipe": wipe,
+    "put_down": put_down,
+    "look_around": look_around,
+    "gesture": gesture,
 }
 #: Sequences that make sense together, besides each activity alone.
 RECIPES: Final[tuple[tuple[str, ...], ...]] = (
@@ -354,4 +539,16 @@ RECIPES: Final[tuple[tuple[str, ...], ...]] = (
     ("reach", "reach_both"),
     ("turn", "push"),
     ("pull", "walk_back"),
+    ("open", "pick"),
+    ("pick", "close"),
+    ("carry", "put_down"),
+    ("lift", "put_down"),
+    ("walk", "pour"),
+    ("turn", "wipe"),
+    ("look_around", "walk"),
+    ("gesture", "walk"),
+    ("walk", "gesture"),
+    ("gesture", "reach"),
+    ("walk", "pick", "turn"),
+    ("turn", "walk", "place"),
 )

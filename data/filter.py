@@ -4,12 +4,15 @@ Two stages. Before retargeting: PHC's hand-made list for HumanML3D (where it app
 that starts in the air, or has both feet up for long). After retargeting: gates on the metrics, because the list misses some
 sitting clips and cannot know the robot.
 
-Paper: data preparation, "filtered with PHC", 11k clips. PHC's test by tracking in physics is left out.
+Paper: data preparation, "filtered with PHC", 11k clips. PHC's test by tracking in physics is left out here
+(`data.tracking` measures a part of it).
+Run `python -m data.filter table FOLDER` for what was dropped, where and why.
 """
 
 from __future__ import annotations
 
 import csv
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -24,12 +27,17 @@ from data.contacts import contact_runs
 from data.metrics import Metrics
 from data.skeleton import HumanMotion, index
 
-__all__ = ["PhcDecision", "apply_phc_list", "automatic_rule", "gate", "phc_list"]
+__all__ = ["GATES", "PhcDecision", "admit", "apply_phc_list", "automatic_rule", "gate", "phc_list", "reason_group"]
 
 _START_AIR_M: Final = 0.1
 _TOES_UP_M: Final = 0.2
 _TOES_UP_FRAMES: Final = 30
-_MAX: Final = (
+_LISTED: Final = "PHC list: "
+_STARTS: Final = "starts "
+_FEET_UP: Final = "both feet above "
+_PELVIS: Final = "pelvis below "
+#: Metrics with an upper limit in `GateConfig`, in the order in which they are tried.
+GATES: Final = (
     "hand_cm",
     "foot_cm",
     "arm_deg",
@@ -39,6 +47,7 @@ _MAX: Final = (
     "float_pct",
     "saturation_pct",
     "velocity_pct",
+    "self_pct",
 )
 
 
@@ -67,7 +76,7 @@ def apply_phc_list(clip: HumanMotion) -> HumanMotion | str:
     if decision is None:
         return clip
     if decision.decision != "truncate":
-        return f"PHC list: {decision.issue or decision.decision}"
+        return f"{_LISTED}{decision.issue or decision.decision}"
     frames = min(decision.frames, len(clip.joints))
     opening = None if clip.hand_opening is None else clip.hand_opening[:frames]
     end = (frames - 1) / clip.fps
@@ -79,13 +88,33 @@ def automatic_rule(clip: HumanMotion) -> str:
     """PHC's automatic rule on joints: reason to drop the clip, or an empty string."""
     lowest = float(clip.joints[0, :, 2].min())
     if lowest > _START_AIR_M:
-        return f"starts {lowest:.2f} m above the floor"
+        return f"{_STARTS}{lowest:.2f} m above the floor"
     toes = clip.joints[:, [index("left_foot"), index("right_foot")], 2]
     up = toes.min(axis=1) > _TOES_UP_M
     longest = max((end - start for start, end in contact_runs(up)), default=0)
     if longest > _TOES_UP_FRAMES:
-        return f"both feet above {_TOES_UP_M} m for {longest} frames"
+        return f"{_FEET_UP}{_TOES_UP_M} m for {longest} frames"
     return ""
+
+
+def admit(clip: HumanMotion, use_list: bool) -> HumanMotion | str:
+    """What of a clip is retargeted, or the reason why none of it is: PHC's list, where it applies, then the automatic rule."""
+    kept = apply_phc_list(clip) if use_list else clip
+    return kept if isinstance(kept, str) else automatic_rule(kept) or kept
+
+
+def reason_group(robot: str, reason: str) -> str:
+    """What dropped a clip: `PHC list: ISSUE`, `automatic rule`, `unusable`, or the name of a gate.
+
+    Args:
+        robot: of a clip dropped after retargeting, else empty.
+        reason: of `admit`, of `gate`, or of a clip that could not be loaded.
+    """
+    if robot:
+        return "low_pelvis" if reason.startswith(_PELVIS) else reason.split()[0]
+    if reason.startswith(_LISTED):
+        return reason
+    return "automatic rule" if reason.startswith((_STARTS, _FEET_UP)) else "unusable"
 
 
 def gate(metrics: Metrics, pelvis_height_m: NDArray[np.float64], standing_m: float, fps: float, limits: GateConfig) -> str:
@@ -98,12 +127,18 @@ def gate(metrics: Metrics, pelvis_height_m: NDArray[np.float64], standing_m: flo
         fps: frames per second.
         limits: what is allowed.
     """
-    for name in _MAX:
+    for name in GATES:
         value, limit = getattr(metrics, name), getattr(limits, name)
         if not value <= limit:
             return f"{name} {value:.2f} over {limit:g}"
     is_low = np.asarray(pelvis_height_m < limits.low_pelvis * standing_m, dtype=np.bool_)
     low = max((end - start for start, end in contact_runs(is_low)), default=0)
     if low > limits.low_pelvis_s * fps:
-        return f"pelvis below {limits.low_pelvis:g} of standing for {low / fps:.1f} s"
+        return f"{_PELVIS}{limits.low_pelvis:g} of standing for {low / fps:.1f} s"
     return ""
+
+
+if __name__ == "__main__":
+    from data.filter_table import main
+
+    sys.exit(main(sys.argv[1:]))

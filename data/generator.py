@@ -27,8 +27,8 @@ __all__ = ["GENERATOR_VERSION", "generate_clip", "write_dataset"]
 
 Array = NDArray[np.float64]
 #: Raised when the same seed gives other clips than before.
-GENERATOR_VERSION: Final = 1
-_DURATION_S: Final = (2.0, 8.0)
+GENERATOR_VERSION: Final = 2
+_DURATION_S: Final = (2.0, 10.0)
 _SUBJECTS: Final = ("a person", "someone", "the person", "a man", "a woman", "the figure")
 _JOINERS: Final = (" and then ", ", then ", " before the person ")
 _TAGS: Final = {
@@ -43,7 +43,7 @@ _TAG_OF: Final = {word: tag for tag, words in _TAGS.items() for word in words.sp
 
 
 def generate_clip(seed: int, number: int) -> HumanMotion:
-    """Clip `number` of a seed: 2 to 8 s at 20 frames per second.
+    """Clip `number` of a seed: 2 to 10 s at 20 frames per second.
 
     The recipes take turns, so that a few dozen clips cover every activity. Nine in ten clips are for training, the others
     alternate between validation and test.

@@ -21,7 +21,7 @@ from data.motion import FPS
 from data.representation import VECTOR_SIZE, joints_from_vectors
 from data.skeleton import JOINTS, Caption, HumanMotion, to_z_up
 
-__all__ = ["DatasetError", "Skipped", "list_clips", "load_clip", "load_dataset", "parse_captions"]
+__all__ = ["DatasetError", "Skipped", "check_joints", "list_clips", "load_clip", "load_dataset", "parse_captions"]
 
 logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -108,16 +108,7 @@ def load_clip(folder: Path, name: str, split: str = "train") -> HumanMotion:
     if not name.replace("_", "").isalnum():
         raise DatasetError(f"{name!r}: not a clip id")
     joints = to_z_up(_joints(folder, name))
-    if len(joints) < _MIN_FRAMES:
-        raise DatasetError(f"{name}: {len(joints)} frames; at least {_MIN_FRAMES} are needed")
-    if not np.isfinite(joints).all():
-        raise DatasetError(f"{name}: positions that are not finite")
-    height = float(np.ptp(joints[:, :, 2], axis=1).max())
-    if not 0.5 < height < 3.0:
-        raise DatasetError(f"{name}: body {height:.2f} m tall; expected 0.5 to 3 m (are the units metres, is y up?)")
-    jump = float(np.abs(np.diff(joints[:, 0], axis=0)).max())
-    if jump > 0.75:
-        raise DatasetError(f"{name}: the pelvis jumps {jump:.2f} m between frames")
+    check_joints(name, joints)
     path = folder / "texts" / f"{name}.txt"
     try:
         text = path.read_text(encoding="utf-8")
@@ -125,6 +116,26 @@ def load_clip(folder: Path, name: str, split: str = "train") -> HumanMotion:
         raise DatasetError(f"{path}: {error}") from error
     captions = parse_captions(text, (len(joints) - 1) / FPS, path.name)
     return HumanMotion(name, joints, FPS, captions, _hand_opening(folder, name, len(joints)), split)
+
+
+def check_joints(name: str, joints: Array) -> None:
+    """Refuses joints (T, 22, 3), z up, that are no plausible motion at 20 frames per second.
+
+    Raises:
+        DatasetError: naming the clip, the value and what is allowed.
+    """
+    if len(joints) < _MIN_FRAMES:
+        raise DatasetError(f"{name}: {len(joints)} frames; at least {_MIN_FRAMES} are needed")
+    if not np.isfinite(joints).all():
+        raise DatasetError(f"{name}: positions that are not finite")
+    height = float(np.ptp(joints[:, :, 2], axis=1).max())
+    if not 0.5 < height < 3.0:
+        raise DatasetError(
+            f"{name}: body {height:.2f} m tall; expected 0.5 to 3 m (are the units metres, is the right axis up?)"
+        )
+    jump = float(np.abs(np.diff(joints[:, 0], axis=0)).max())
+    if jump > 0.75:
+        raise DatasetError(f"{name}: the pelvis jumps {jump:.2f} m between frames")
 
 
 def _load_array(path: Path) -> Array:

@@ -22,14 +22,16 @@ from typing import Any, Final
 import numpy as np
 
 from configs.schema.data import DataConfig, ReplayConfig
-from data.filter import apply_phc_list, automatic_rule, gate
+from data.cluster import ray_instance
+from data.filter import admit, gate, reason_group
 from data.generator import GENERATOR_VERSION, write_dataset
-from data.humanml3d import DatasetError, list_clips, load_clip
+from data.humanml3d import DatasetError
 from data.metrics import Metrics, evaluate
 from data.motion import FPS
 from data.records import Motion
 from data.retarget import Retargeter
 from data.shards import Manifest, ShardWriter, config_hash
+from data.sources import clip_ids, read_clip
 from data.workers import start_worker
 from sim.robots.spec import load_robot
 
@@ -37,6 +39,8 @@ __all__ = ["PartResult", "Pictures", "Replay", "build_clips", "dataset_folder", 
 
 #: Raised when the same configuration gives other shards than before.
 _VERSION: Final = 1
+#: Fields that do not decide what is in the shards.
+_NOT_CONTENT: Final = ("workers", "path", "body_models", "scheduler", "ray_address")
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +75,12 @@ Replay = Callable[[Motion, ReplayConfig, int], Pictures | None]
 
 @dataclass(frozen=True, slots=True)
 class PartResult:
-    """Rows of one part, what was dropped and why, and the metrics of what was kept."""
+    """Rows of one part, what was dropped and why, what PHC's list cut short, and the metrics of what was kept."""
 
+    clips: int
     rows: list[dict[str, Any]]
     dropped: list[tuple[str, str, str]]
+    truncated: list[str]
     metrics: list[tuple[str, Metrics]]
     without_pictures: int
     retarget_s: float
@@ -83,7 +89,7 @@ class PartResult:
 
 def dataset_folder(cfg: DataConfig, out: Path) -> Path:
     """The folder that clips are read from; generated clips are made when they are not there."""
-    if cfg.source == "humanml3d":
+    if cfg.source != "generated":
         assert cfg.path is not None
         return Path(cfg.path).expanduser()
     folder = Path(cfg.path) if cfg.path else out.parent / f"generated-{cfg.clips}-{cfg.seed}"
@@ -104,20 +110,21 @@ def part_of_clips(cfg: DataConfig, folder: Path, clips: Sequence[tuple[str, str]
         clips: (id, split) of each clip.
         replay: makes pictures, None for none.
     """
-    result = PartResult([], [], [], 0, 0.0, 0)
+    result = PartResult(len(clips), [], [], [], [], 0, 0.0, 0)
     without = frames = 0
     seconds = 0.0
     for name, split in clips:
         try:
-            human = load_clip(folder, name, split)
+            human = read_clip(cfg, folder, name, split)
         except DatasetError as error:
             result.dropped.append((name, "", str(error)))
             continue
-        kept = apply_phc_list(human) if cfg.phc_list else human
-        reason = kept if isinstance(kept, str) else automatic_rule(kept)
-        if reason or isinstance(kept, str):
-            result.dropped.append((name, "", str(reason)))
+        kept = admit(human, cfg.phc_list)
+        if isinstance(kept, str):
+            result.dropped.append((name, "", kept))
             continue
+        if len(kept.joints) < len(human.joints):
+            result.truncated.append(name)
         for robot in cfg.robots:
             retargeter = _retargeter(robot, cfg.iterations)
             start = time.perf_counter()
@@ -181,12 +188,10 @@ def build_clips(
         data.shards.ShardError: when the folder holds shards of another configuration and `overwrite` is off.
     """
     folder = dataset_folder(cfg, out)
-    clips = [(name, split) for name, split in list_clips(folder, cfg.splits) if cfg.mirrored or not name.startswith("M")]
-    if cfg.source == "humanml3d" and cfg.clips:
-        clips = clips[: cfg.clips]
+    clips = clip_ids(cfg, folder)
     if not clips:
         raise DatasetError(f"{folder}: no clip in {', '.join(cfg.splits)}")
-    keyed = {key: value for key, value in dataclasses.asdict(cfg).items() if key not in ("workers", "path")}
+    keyed = {key: value for key, value in dataclasses.asdict(cfg).items() if key not in _NOT_CONTENT}
     keyed |= {
         "version": _VERSION,
         "generator": GENERATOR_VERSION,
@@ -215,6 +220,9 @@ def build_clips(
 def _computed(
     cfg: DataConfig, folder: Path, parts: Sequence[Sequence[tuple[str, str]]], missing: Sequence[int], replay: Replay | None
 ) -> Iterator[tuple[int, PartResult]]:
+    if cfg.scheduler == "ray":
+        yield from _on_ray(cfg, folder, parts, missing, replay)
+        return
     if cfg.workers == 1 or len(missing) < 2:
         for index in missing:
             yield index, part_of_clips(cfg, folder, parts[index], replay)
@@ -226,6 +234,23 @@ def _computed(
             yield futures.pop(future), future.result()
 
 
+def _on_ray(
+    cfg: DataConfig, folder: Path, parts: Sequence[Sequence[tuple[str, str]]], missing: Sequence[int], replay: Replay | None
+) -> Iterator[tuple[int, PartResult]]:
+    """Parts computed on a Ray instance; one whose worker dies is computed again (Ray's own retries)."""
+    with ray_instance(cfg.workers, cfg.ray_address) as ray:
+        work = ray.remote(part_of_clips).options(num_cpus=1, max_retries=2)
+        waiting = list(missing)
+        running: dict[Any, int] = {}
+        while waiting or running:
+            while waiting and len(running) < 2 * max(cfg.workers, 1):  # no more than can be written while they come in
+                index = waiting.pop(0)
+                running[work.remote(cfg, folder, parts[index], replay)] = index
+            done, _ = ray.wait(list(running))
+            for reference in done:
+                yield running.pop(reference), ray.get(reference)
+
+
 def _notes(result: PartResult) -> dict[str, Any]:
     by_robot: dict[str, list[Metrics]] = {}
     for robot, metrics in result.metrics:
@@ -234,7 +259,9 @@ def _notes(result: PartResult) -> dict[str, Any]:
     for mean in means.values():
         mean["balance_cm"] = mean["balance_cm"] if np.isfinite(mean["balance_cm"]) else None
     return {
+        "clips": result.clips,
         "rows": len(result.rows),
+        "truncated": result.truncated,
         "dropped": [list(entry) for entry in result.dropped],
         "without_pictures": result.without_pictures,
         "retarget_s": round(result.retarget_s, 3),
@@ -250,7 +277,7 @@ def _metrics(row: dict[str, Any]) -> Metrics:
 
 def _summary(notes: dict[str, Any]) -> dict[str, Any]:
     parts = list(notes.values())
-    reasons = Counter(reason.split(" over ")[0].rsplit(" ", 1)[0] for part in parts for _, _, reason in part["dropped"])
+    reasons = Counter(reason_group(robot, reason) for part in parts for _, robot, reason in part["dropped"])
     metrics: dict[str, Any] = {}
     for robot in sorted({robot for part in parts for robot in part["metrics"]}):
         rows = [part["metrics"][robot] for part in parts if robot in part["metrics"]]

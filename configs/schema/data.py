@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 __all__ = ["DataConfig", "GateConfig", "ReplayConfig"]
+
+_HOLDS: Final = {"humanml3d": "new_joints", "amass": "npz", "folder": "motions"}
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,7 @@ class GateConfig:
         float_pct: frames in contact with both soles more than 2 cm up.
         saturation_pct: joint-frames at a limit.
         velocity_pct: frames with a joint faster than its limit.
+        self_pct: frames in which parts that are no neighbours overlap by more than 1 cm.
         low_pelvis: share of the standing pelvis height that counts as low.
         low_pelvis_s: longest time in which the pelvis may be low.
     """
@@ -34,6 +37,7 @@ class GateConfig:
     float_pct: float = 10.0
     saturation_pct: float = 25.0
     velocity_pct: float = 1.0
+    self_pct: float = 10.0
     low_pelvis: float = 0.5
     low_pelvis_s: float = 0.5
 
@@ -70,9 +74,11 @@ class DataConfig:
     """Motion data.
 
     Attributes:
-        source: `generated`, or `humanml3d` for a folder in HumanML3D's format.
-        path: the folder; needed for `humanml3d`, None puts generated clips beside the shards.
-        clips: generated clips; for `humanml3d` the most clips that are read, 0 for all.
+        source: `generated`; `humanml3d` for a folder in HumanML3D's format; `amass` for a folder of AMASS; `folder` for one of
+            `.npz` (AMASS), `.pt` (OMOMO) and `.npy` (motion capture) files.
+        path: the folder; needed unless clips are generated, None puts those beside the shards.
+        body_models: folder of SMPL models, needed for AMASS clips.
+        clips: generated clips; else the most clips that are read, 0 for all.
         seed: of the generated clips and of the placements.
         splits: which lists are read.
         mirrored: whether ids with prefix M are read.
@@ -81,12 +87,16 @@ class DataConfig:
         iterations: solver iterations per frame.
         part_size: clips per part file.
         workers: processes; 1 stays in this one.
+        scheduler: who runs the workers, `local` processes or `ray`; with `ray` on a cluster, `workers` says how many parts are
+            computed at a time.
+        ray_address: a running Ray cluster that shares the data set's folder; None starts Ray on this machine for the run.
         gates: what a clip must satisfy.
         replay: pictures.
     """
 
-    source: Literal["generated", "humanml3d"] = "generated"
+    source: Literal["generated", "humanml3d", "amass", "folder"] = "generated"
     path: str | None = None
+    body_models: str | None = None
     clips: int = 360
     seed: int = 0
     splits: tuple[str, ...] = ("train", "val", "test")
@@ -96,12 +106,16 @@ class DataConfig:
     iterations: int = 3
     part_size: int = 24
     workers: int = 2
+    scheduler: Literal["local", "ray"] = "local"
+    ray_address: str | None = None
     gates: GateConfig = field(default_factory=GateConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
     def __post_init__(self) -> None:
-        if self.source == "humanml3d" and not self.path:
-            raise ValueError("path is needed: data=humanml3d data.path=/folder/with/new_joints")
+        if self.source != "generated" and not self.path:
+            raise ValueError(f"path is needed: data={self.source} data.path=/folder/with/{_HOLDS[self.source]}")
+        if self.source == "amass" and not self.body_models:
+            raise ValueError("body_models is needed: data.body_models=/folder/with/smplh")
         if self.clips < 0 or (self.source == "generated" and self.clips == 0):
             raise ValueError(f"clips {self.clips} must be positive")
         if not self.robots:

@@ -6,6 +6,7 @@ switch: `mpe.mode=mrope` and `cse.enabled=false` together give the base model, b
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -108,7 +109,10 @@ class MotionTokenizerConfig:
     Attributes:
         features: motion features per frame.
         window: frames of a proprioception window.
-        codes: codebook size.
+        quantizer: `vq` (paper), or beyond it `rvq` (residual, one token per codebook and step) or `fsq` (a rounded grid).
+        codes: codebook size; with `fsq` it has to be the product of the levels.
+        stages: codebooks of `rvq`.
+        levels: values per dimension of `fsq`.
         code_dim: width of a code.
         width: convolution channels.
         depth: residual blocks per resolution.
@@ -124,7 +128,10 @@ class MotionTokenizerConfig:
 
     features: int = 48
     window: int = 64
+    quantizer: Literal["vq", "rvq", "fsq"] = "vq"
     codes: int = 512
+    stages: int = 2
+    levels: tuple[int, ...] = (8, 8, 8)
     code_dim: int = 128
     width: int = 128
     depth: int = 2
@@ -138,20 +145,39 @@ class MotionTokenizerConfig:
     reset_below: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("features", "window", "codes", "code_dim", "width", "depth", "dilation", "down"):
+        for name in ("features", "window", "codes", "stages", "code_dim", "width", "depth", "dilation", "down"):
             _require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
         _require(self.window <= LONGEST_WINDOW, f"window {self.window} must be at most {LONGEST_WINDOW}, what shards hold")
         _require(self.window % self.stride == 0, f"window {self.window} must be a multiple of {self.stride}")
 
+        grid = math.prod(self.levels)
+        _require(
+            self.quantizer != "fsq" or grid == self.codes, f"levels {self.levels} make {grid} codes, not codes {self.codes}"
+        )
+        _require(min(self.levels, default=0) > 2, f"levels {self.levels} must each be at least 3")
+        _require(
+            self.quantizer == "vq" or self.update == "ema", f"update {self.update!r} is for quantizer vq, not {self.quantizer}"
+        )
+
     @property
     def stride(self) -> int:
-        """Frames per token."""
+        """Frames per step of the encoding."""
         return 2**self.down
+
+    @property
+    def codebooks(self) -> int:
+        """Tokens per step of the encoding."""
+        return self.stages if self.quantizer == "rvq" else 1
+
+    @property
+    def vocabulary(self) -> int:
+        """Different motion tokens."""
+        return self.codes * self.codebooks
 
     @property
     def window_tokens(self) -> int:
         """Tokens of one proprioception window."""
-        return self.window // self.stride
+        return self.window // self.stride * self.codebooks
 
 
 @dataclass(frozen=True)

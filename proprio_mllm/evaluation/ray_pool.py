@@ -1,109 +1,32 @@
-"""Episodes on a Ray instance: actors with a simulator each, and on request one with the model.
+"""Episodes on a Ray instance (`data.cluster`): actors with a simulator each, and on request one with the model.
 
-Without an address Ray is started for the run on this machine, on the loopback interface, with as many CPUs as there are
-workers, without dashboard and usage reports. With one, the same code runs on a cluster, where this project has to be installed
-on every node. An actor that dies is replaced and its episode run again; after `retries` further attempts it becomes an
-infrastructure error.
+An actor that dies is replaced and its episode run again; after `retries` further attempts it becomes an infrastructure error.
 
 Paper: none (engineering).
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from configs.schema.eval import PlannerConfig
+from data.cluster import import_ray
 from data.records import Observation
 from proprio_mllm.evaluation.batching import AskingPlanner, Batcher, batch_planner
 from proprio_mllm.evaluation.pool import Worker
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
 
-__all__ = ["RayServer", "import_ray", "ray_instance", "ray_model", "run_ray_jobs"]
+__all__ = ["RayServer", "ray_model", "run_ray_jobs"]
 
 logger = logging.getLogger(__name__)
 
 J = TypeVar("J")
 R = TypeVar("R")
-
-#: One thread per worker, drawing without a screen, nothing from a hub.
-_ENVIRONMENT: Final = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl"),
-    "HF_HUB_OFFLINE": "1",
-}
-#: Ray's own settings: it reports nothing, and workers without a GPU of their own see the machine's, as in a process pool.
-_QUIET: Final = {
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    "RAY_ENABLE_METRICS_COLLECTION": "0",
-}
-#: The name is the one that Ray has for it; where it is 0, its own address is 127.0.0.1 on every system.
-_LOOPBACK: Final = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
-_OBJECT_STORE_BYTES: Final = 200_000_000
-
-
-def import_ray(address: str | None = None) -> Any:
-    """The module `ray`.
-
-    Args:
-        address: of a cluster; without one Ray is told, before it is first imported, to keep to the loopback interface.
-
-    Raises:
-        ValueError: when it is not installed; the message names the extra.
-    """
-    os.environ.update(_QUIET)
-    if address is None:
-        os.environ[_LOOPBACK] = "0"
-    try:
-        import ray
-    except ImportError as error:
-        raise ValueError("scheduler=ray needs Ray, which is not installed: pip install 'proprio-mllm[ray]'") from error
-    return ray
-
-
-@contextlib.contextmanager
-def ray_instance(workers: int, address: str | None) -> Iterator[Any]:
-    """Ray, started or connected for the time of the block; one that this process already uses is used and left as it is.
-
-    Args:
-        workers: CPUs of an instance started here.
-        address: of a running cluster.
-
-    Raises:
-        ValueError: when there is no cluster at the address.
-    """
-    ray = import_ray(address)
-    if ray.is_initialized():
-        yield ray
-        return
-    quiet = {"include_dashboard": False, "log_to_driver": False, "logging_level": logging.ERROR}
-    if address is None:
-        before = {name: os.environ.get(name) for name in _ENVIRONMENT}
-        os.environ.update(_ENVIRONMENT)  # its processes take over the environment of this moment
-        try:
-            ray.init("local", num_cpus=workers, object_store_memory=_OBJECT_STORE_BYTES, _node_ip_address="127.0.0.1", **quiet)
-        finally:
-            for name, value in before.items():
-                os.environ.pop(name) if value is None else os.environ.__setitem__(name, value)
-    else:
-        del quiet["include_dashboard"]
-        try:
-            ray.init(address, runtime_env={"env_vars": _ENVIRONMENT | _QUIET}, **quiet)
-        except (ConnectionError, ValueError) as error:
-            raise ValueError(f"ray_address={address!r}: no cluster answers there ({error})") from error
-    try:
-        yield ray
-    finally:
-        ray.shutdown()
 
 
 class _EpisodeActor:

@@ -24,12 +24,12 @@ from tqdm import tqdm
 
 import configs
 from configs.schema.eval import EvalConfig, PlannerConfig
+from data.cluster import import_ray
 from data.files import file_hash, write_text
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.batching import batch_planner
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
 from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledger, scored
-from proprio_mllm.evaluation.ray_pool import import_ray
 from proprio_mllm.evaluation.scheduling import scheduled
 from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, Opener, WorkerSetup

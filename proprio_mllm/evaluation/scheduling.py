@@ -10,8 +10,9 @@ import functools
 from collections.abc import Callable, Generator, Sequence
 
 from configs.schema.eval import EvalConfig
+from data.cluster import ray_instance
 from proprio_mllm.evaluation.pool import run_jobs, run_side_by_side
-from proprio_mllm.evaluation.ray_pool import ray_instance, ray_model, run_ray_jobs
+from proprio_mllm.evaluation.ray_pool import ray_model, run_ray_jobs
 from proprio_mllm.evaluation.serving import model_process
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWorker, Opener, WorkerSetup, lost_episode
 

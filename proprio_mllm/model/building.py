@@ -76,7 +76,7 @@ def build_processor(cfg: ModelConfig, texts: Sequence[str] = (), whole_words: Se
         processor = make_processor(train_tokenizer(texts, cfg.vocab_size, whole_words), cfg.image_size)
     else:
         raise ValueError(f"model {cfg.name!r} has no weights: texts are needed to train its tokenizer")
-    add_motion_tokens(processor.tokenizer, cfg.motion.codes)
+    add_motion_tokens(processor.tokenizer, cfg.motion.vocabulary)
     return processor
 
 
@@ -120,7 +120,7 @@ def build_model(
         else:
             vlm = Qwen2_5_VLForConditionalGeneration(backbone_config(cfg, processor)).to(dtype)
         _extend(vlm, len(processor.tokenizer))
-        motion_ids = add_motion_tokens(processor.tokenizer, cfg.motion.codes)
+        motion_ids = add_motion_tokens(processor.tokenizer, cfg.motion.vocabulary)
         if point_map is None and cfg.cse.enabled:
             point_map = build_point_map(cfg)
         return ProprioMLLM(vlm, cfg, processor, motion_ids, point_map)

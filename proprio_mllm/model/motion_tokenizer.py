@@ -1,14 +1,15 @@
 """Motion VQ-VAE: windows of motion features to discrete tokens and back (paper: stage 1, motion tokenizer).
 
-A 1-D convolutional encoder halves the frame rate `down` times, a codebook quantises each step, a mirrored decoder rebuilds the
-features. Loss, as in the paper: reconstruction + alpha * codebook + beta * commitment, and optionally a smooth-L1 term on frame
-differences (MotionGPT's "velocity" term, here true finite differences in metres per frame). D(z) means D(e) with the
-straight-through gradient. Features are normalised by the mean and deviation stored with the weights.
+A 1-D convolutional encoder halves the frame rate `down` times, a quantiser (`quantizer.py`) turns each step into tokens, a
+mirrored decoder rebuilds the features. Loss, as in the paper: reconstruction + alpha * codebook + beta * commitment, and
+optionally a smooth-L1 term on frame differences (MotionGPT's "velocity" term, here true finite differences in metres per
+frame). D(z) means D(e) with the straight-through gradient. Features are normalised by the mean and deviation stored with the
+weights.
 
 Every window is padded with copies of its own first and last frame only, so a window encodes to the same tokens
 online and from a shard.
 
-Shape letters: B batch, T frames, F features, N = T / stride tokens, C channels.
+Shape letters: B batch, T frames, F features, N = T / stride steps, C channels.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from torch.nn import functional
 from configs.schema.model import MotionTokenizerConfig
 from configs.validate import build
 from data.files import write_text
-from proprio_mllm.model.quantizer import VectorQuantizer
+from proprio_mllm.model.quantizer import MotionQuantizer
 
 __all__ = ["MotionTokenizer", "TokenizerLoss"]
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +97,7 @@ class MotionTokenizer(nn.Module):
         for _ in range(cfg.down):
             decoder += [*_stack(width, cfg.depth, cfg.dilation, reverse=True), nn.Upsample(scale_factor=2), _conv(width, width)]
         self.decoder = nn.Sequential(*decoder, _conv(width, width), nn.ReLU(), _conv(width, cfg.features))
-        self.quantizer = VectorQuantizer(cfg.codes, cfg.code_dim, cfg.update, cfg.ema_decay, cfg.reset_below)
+        self.quantizer = MotionQuantizer(cfg)
         self.register_buffer("mean", torch.zeros(cfg.features))
         self.register_buffer("std", torch.ones(cfg.features))
 
@@ -151,13 +152,19 @@ class MotionTokenizer(nn.Module):
 
     @torch.no_grad()
     def encode(self, motion: Tensor) -> Tensor:
-        """Token ids (B, T / stride) of motion (B, T, F) in raw units."""
-        return self.quantizer.nearest(self._encode(motion))
+        """Tokens (B, T / stride * codebooks) of motion (B, T, F) in raw units, those of one step together."""
+        return self.quantizer.tokens(self._encode(motion)).flatten(1)
 
     @torch.no_grad()
     def decode(self, ids: Tensor) -> Tensor:
-        """Motion (B, T, F) in raw units of token ids (B, T / stride)."""
-        return self._decode(self.quantizer.lookup(ids)) * self.std + self.mean
+        """Motion (B, T, F) in raw units of tokens (B, T / stride * codebooks).
+
+        Raises:
+            ValueError: on tokens outside the vocabulary, or not whole steps of them.
+        """
+        if ids.shape[1] % self.cfg.codebooks:
+            raise ValueError(f"motion: {ids.shape[1]} tokens; expected a multiple of {self.cfg.codebooks}")
+        return self._decode(self.quantizer.lookup(ids.unflatten(1, (-1, self.cfg.codebooks)))) * self.std + self.mean
 
     def encode_window(self, motion: NDArray[np.floating]) -> tuple[int, ...]:
         """Token ids of one window (T, F): the newest `cfg.window` frames; a shorter one is padded with its first frame.

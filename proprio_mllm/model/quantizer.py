@@ -1,22 +1,30 @@
-"""Vector quantiser with a moving-average codebook (paper: stage 1, Eq. 1-2).
+"""Quantisers of the motion tokenizer (paper: stage 1, Eq. 1-2), on vector-quantize-pytorch's.
 
-The codebook, its moving counts and sums are buffers, so that a resumed run continues with the codebook it had. Two update
-rules: `ema`, moving averages as in MotionGPT and T2M-GPT (the codebook loss has no gradient then and is logged only), and
-`grad`, the codebook loss as printed.
+`vq` is the paper's: one codebook, kept by moving averages of the encodings (`ema`, as in MotionGPT and T2M-GPT; the codebook
+loss has no gradient then and is logged only) or by the gradient of the codebook loss as printed (`grad`). Beyond the paper:
+`rvq`, several codebooks of which each quantises what the one before left over, and `fsq`, no codebook but a rounded grid.
 
-Shape letters: N vectors, D code width, C codes.
+A step of an encoding becomes one token, with `rvq` one per codebook; tokens of the later codebooks are counted on, so that a
+token says which codebook it belongs to. The library's defaults differ from the paper's rules (decay, dead codes, rotation
+trick) and are set here; its draws follow the caller's generator. Codebooks, counts and sums are buffers of the state dict.
+
+Shape letters: B batch, N steps, D code width, C codes, Q codebooks (1 but for `rvq`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from vector_quantize_pytorch import FSQ, ResidualVQ, VectorQuantize
 
-__all__ = ["Quantised", "VectorQuantizer"]
+from configs.schema.model import MotionTokenizerConfig
+
+__all__ = ["MotionQuantizer", "Quantised"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,123 +32,115 @@ class Quantised:
     """Result of a quantisation.
 
     Attributes:
-        vectors: (..., D) chosen codes with the straight-through gradient.
-        ids: (...) indices.
-        codebook_loss: mean squared distance of codes to fixed encodings.
-        commitment_loss: mean squared distance of encodings to fixed codes.
-        perplexity: exp of the entropy of the batch's code use, in [1, C].
+        vectors: (B, N, D) chosen codes with the straight-through gradient.
+        tokens: (B, N, Q) indices in [0, Q C).
+        codebook_loss: mean squared distance of codes to fixed encodings, summed over codebooks; 0 without a codebook.
+        commitment_loss: mean squared distance of encodings to fixed codes, likewise.
+        perplexity: exp of the entropy of the batch's token use, in [1, Q C].
     """
 
     vectors: Tensor
-    ids: Tensor
+    tokens: Tensor
     codebook_loss: Tensor
     commitment_loss: Tensor
     perplexity: Tensor
 
 
-class VectorQuantizer(nn.Module):
-    """Nearest-code quantiser.
+class MotionQuantizer(nn.Module):
+    """Turns encodings into tokens and back.
 
     Args:
-        codes: number of codes C.
-        dim: width of a code D.
-        update: `ema` or `grad`.
-        decay: decay of the moving averages.
-        reset_below: a code whose moving count is below this is replaced by a random vector of the batch.
+        cfg: sizes and rules.
     """
 
-    codebook: Tensor
-    counts: Tensor
-    sums: Tensor
-    initialised: Tensor
-
-    def __init__(
-        self, codes: int, dim: int, update: Literal["ema", "grad"] = "ema", decay: float = 0.99, reset_below: float = 1.0
-    ) -> None:
+    def __init__(self, cfg: MotionTokenizerConfig) -> None:
         super().__init__()
-        if update not in ("ema", "grad"):
-            raise ValueError(f"update {update!r} is not allowed; allowed: ema, grad")
-        self.codes, self.dim, self.update, self.decay, self.reset_below = codes, dim, update, decay, reset_below
-        start = torch.zeros(codes, dim)
-        if update == "grad":
-            self.codebook = nn.Parameter(start)
+        self.cfg = cfg
+        learned = cfg.update == "grad"
+        rules = {
+            "codebook_size": cfg.codes,
+            "decay": cfg.ema_decay,
+            "threshold_ema_dead_code": cfg.reset_below,
+            "commitment_weight": 1.0,
+            "rotation_trick": False,
+            "kmeans_init": True,
+            "ema_update": not learned,
+            "learnable_codebook": learned,
+        }
+        if cfg.quantizer == "vq":
+            self.inner: nn.Module = VectorQuantize(cfg.code_dim, **rules)
+        elif cfg.quantizer == "rvq":
+            self.inner = ResidualVQ(dim=cfg.code_dim, num_quantizers=cfg.stages, **rules)
         else:
-            self.register_buffer("codebook", start)
-        self.register_buffer("counts", torch.zeros(codes))
-        self.register_buffer("sums", torch.zeros(codes, dim))
-        self.register_buffer("initialised", torch.zeros((), dtype=torch.bool))
+            self.inner = FSQ(list(cfg.levels), dim=cfg.code_dim)
 
-    def nearest(self, vectors: Tensor) -> Tensor:
-        """Index (...) of the code nearest to each vector (..., D)."""
-        flat = vectors.reshape(-1, self.dim)
-        distance = self.codebook.pow(2).sum(1) - 2 * flat @ self.codebook.T  # (N, C), up to a term equal for all codes
-        return distance.argmin(dim=1).reshape(vectors.shape[:-1])
+    def tokens(self, vectors: Tensor) -> Tensor:
+        """Tokens (B, N, Q) of encodings (B, N, D); changes nothing."""
+        training = self.inner.training
+        self.inner.eval()
+        try:
+            indices = self.inner(vectors)[1]
+        finally:
+            self.inner.train(training)
+        return self._counted(indices)
 
-    def lookup(self, ids: Tensor) -> Tensor:
-        """Codes (..., D) of indices (...).
+    def lookup(self, tokens: Tensor) -> Tensor:
+        """Codes (B, N, D) of tokens (B, N, Q).
 
         Raises:
-            ValueError: on an index outside the codebook.
+            ValueError: on a token outside the vocabulary, or of another codebook than its place says.
         """
-        if ids.numel() and (int(ids.min()) < 0 or int(ids.max()) >= self.codes):
-            raise ValueError(f"code {int(ids.min())}..{int(ids.max())} outside the codebook [0, {self.codes})")
-        return self.codebook[ids]
+        cfg = self.cfg
+        first = torch.arange(tokens.shape[-1], device=tokens.device) * cfg.codes
+        indices = tokens - first
+        wrong = (indices < 0) | (indices >= cfg.codes)
+        if bool(wrong.any()):
+            *_, place = wrong.nonzero()[0].tolist()
+            raise ValueError(
+                f"motion token {int(tokens[wrong][0])} outside the codebook [{place * cfg.codes}, {(place + 1) * cfg.codes})"
+            )
+        return self._codes(indices if cfg.quantizer == "rvq" else indices[..., 0])
 
     def forward(self, vectors: Tensor, generator: torch.Generator | None = None) -> Quantised:
-        """Quantises encodings (..., D); in training mode it also updates the codebook.
+        """Quantises encodings (B, N, D); in training mode it also updates the codebooks.
 
         Args:
             vectors: encodings.
-            generator: draws the vectors that replace unused codes.
+            generator: draws the first codes and the vectors that replace unused ones.
         """
-        flat = vectors.reshape(-1, self.dim)
-        if self.training and not bool(self.initialised):
-            self._initialise(flat.detach(), generator)
-        ids = self.nearest(flat.detach())
-        chosen = self.codebook[ids]
-        codebook_loss = functional.mse_loss(chosen, flat.detach())
-        commitment_loss = functional.mse_loss(flat, chosen.detach())
-        through = flat + (chosen - flat).detach()
-        used = functional.one_hot(ids, self.codes).to(flat.dtype)
-        share = used.mean(0)
+        with _own_draws(generator):
+            through, indices, *losses = self.inner(vectors)
+        codebook_loss = commitment_loss = vectors.new_zeros(())
+        if self.cfg.quantizer == "vq":
+            chosen = self._codes(indices) if self.cfg.update == "grad" else through.detach()
+            codebook_loss = functional.mse_loss(chosen, vectors.detach())
+            commitment_loss = functional.mse_loss(vectors, chosen.detach())
+        elif self.cfg.quantizer == "rvq" and self.training:
+            commitment_loss = losses[0].sum()
+            codebook_loss = commitment_loss.detach()
+        if self.cfg.quantizer != "fsq":  # once for all codebooks: the library's would count every one
+            through = vectors + (through - vectors).detach()
+        tokens = self._counted(indices)
+        share = torch.bincount(tokens.flatten(), minlength=self.cfg.vocabulary).to(vectors.dtype) / tokens.numel()
         perplexity = torch.exp(-(share * (share + 1e-10).log()).sum())
-        if self.training:
-            self._update(flat.detach(), used, generator)
-        shape = vectors.shape
-        return Quantised(through.reshape(shape), ids.reshape(shape[:-1]), codebook_loss, commitment_loss, perplexity)
+        return Quantised(through, tokens, codebook_loss, commitment_loss, perplexity)
 
-    def _draw(self, flat: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
-        """`count` vectors of the batch, with a little noise when the batch has fewer."""
-        picked = torch.randint(len(flat), (count,), generator=generator)
-        if len(flat) >= count:
-            picked = torch.randperm(len(flat), generator=generator)[:count]
-        drawn = flat[picked.to(flat.device)]
-        if len(flat) < count:
-            drawn = drawn + torch.randn(drawn.shape, generator=generator).to(drawn) * 0.01 / self.dim**0.5
-        return drawn
+    def _codes(self, indices: Tensor) -> Tensor:
+        inner = self.inner
+        return inner.indices_to_codes(indices) if isinstance(inner, FSQ) else inner.get_output_from_indices(indices)  # type: ignore[operator]
 
-    @torch.no_grad()
-    def _initialise(self, flat: Tensor, generator: torch.Generator | None) -> None:
-        self.codebook.copy_(self._draw(flat, self.codes, generator))
-        self.sums.copy_(self.codebook)
-        self.counts.fill_(1.0)
-        self.initialised.fill_(True)
+    def _counted(self, indices: Tensor) -> Tensor:
+        """Library's indices (B, N) or (B, N, Q) as tokens (B, N, Q)."""
+        indices = (indices if self.cfg.quantizer == "rvq" else indices[..., None]).long()
+        return indices + torch.arange(indices.shape[-1], device=indices.device) * self.cfg.codes
 
-    @torch.no_grad()
-    def _update(self, flat: Tensor, used: Tensor, generator: torch.Generator | None) -> None:
-        counts, sums = used.sum(0), used.T @ flat  # (C,), (C, D)
-        if torch.distributed.is_available() and torch.distributed.is_initialized():
-            torch.distributed.all_reduce(counts)
-            torch.distributed.all_reduce(sums)
-        self.counts.mul_(self.decay).add_(counts, alpha=1 - self.decay)
-        self.sums.mul_(self.decay).add_(sums, alpha=1 - self.decay)
-        # Counts start at 1 and decay towards the mean use; a code of use u per batch settles at u.
-        dead = self.counts < self.reset_below
-        if self.update == "ema":
-            alive = ~dead
-            self.codebook[alive] = self.sums[alive] / self.counts[alive].unsqueeze(1)
-        if bool(dead.any()):
-            fresh = self._draw(flat, int(dead.sum()), generator)
-            self.codebook[dead] = fresh
-            self.sums[dead] = fresh
-            self.counts[dead] = 1.0
+
+@contextmanager
+def _own_draws(generator: torch.Generator | None) -> Iterator[None]:
+    """Within it torch's global draws follow from `generator` alone, and are as before afterwards."""
+    if generator is None:
+        yield
+        return
+    with torch.random.fork_rng():
+        torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
+        yield

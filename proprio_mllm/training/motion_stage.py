@@ -17,18 +17,26 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from data.motion import HAND_OPENING, KEY_BODY_COUNT, N_FEATURES, OPEN_HAND, PELVIS_HEIGHT
+from data.motion import FPS, HAND_OPENING, KEY_BODY_COUNT, N_FEATURES, OPEN_HAND, PELVIS_HEIGHT
 from proprio_mllm.model.geometry import KEY_BODIES
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.sources import Clips, held_out
 
-__all__ = ["FEATURE_BIAS", "MotionObjective", "MotionWindows", "tokenizer_metrics"]
+__all__ = [
+    "FEATURE_BIAS",
+    "MotionObjective",
+    "MotionWindows",
+    "codebook_use",
+    "reconstruction_metrics",
+    "tokenizer_metrics",
+]
 
 #: Factor on each normalised feature (F,).
 FEATURE_BIAS = np.ones(N_FEATURES, dtype=np.float32)
 FEATURE_BIAS[PELVIS_HEIGHT] = 1.5
 FEATURE_BIAS[HAND_OPENING] = 3.0
-HANDS_AND_FEET = [i for i, name in enumerate(KEY_BODIES) if name.endswith(("hand", "ankle"))]
+_HANDS = [i for i, name in enumerate(KEY_BODIES) if name.endswith("hand")]
+_FEET = [i for i, name in enumerate(KEY_BODIES) if name.endswith("ankle")]
 
 
 class MotionWindows:
@@ -88,34 +96,57 @@ class MotionObjective:
 
 
 @torch.no_grad()
-def tokenizer_metrics(tokenizer: MotionTokenizer, windows: MotionWindows, seed: int = 0) -> dict[str, float]:
-    """Reconstruction of held-out clips and windows.
+def reconstruction_metrics(tokenizer: MotionTokenizer, rows: NDArray[np.float32]) -> dict[str, float]:
+    """What tokens keep of windows (N, T, F) in raw units.
 
-    MPJPE, hand and foot error and height error in mm, the share of hands whose state at the end (open or not) survives, and the
-    share of codes that are used.
+    Returns:
+        `mpjpe_mm`, mean distance of the 14 key bodies; `hands_mm` and `feet_mm`, of hands and ankles alone; `velocity_mm_s`,
+        mean difference of the key bodies' velocities; `height_mm` of the pelvis; `hand_state`, share of hands whose state at
+        the end, open or not, survives; `count` of windows.
+    """
+    truth = torch.from_numpy(rows).to(tokenizer.mean.device)
+    rebuilt = torch.cat([tokenizer.decode(tokenizer.encode(part)) for part in truth.split(256)])
+    keys = 3 * KEY_BODY_COUNT
+    away = (rebuilt[..., :keys] - truth[..., :keys]).unflatten(-1, (KEY_BODY_COUNT, 3))  # (N, T, K, 3)
+    error, speed = away.norm(dim=-1), away.diff(dim=1).norm(dim=-1) * FPS
+    hands = (rebuilt[:, -1, HAND_OPENING] >= OPEN_HAND) == (truth[:, -1, HAND_OPENING] >= OPEN_HAND)
+    return {
+        "mpjpe_mm": 1000.0 * float(error.mean()),
+        "hands_mm": 1000.0 * float(error[..., _HANDS].mean()),
+        "feet_mm": 1000.0 * float(error[..., _FEET].mean()),
+        "velocity_mm_s": 1000.0 * float(speed.mean()),
+        "height_mm": 1000.0 * float((rebuilt[..., keys] - truth[..., keys]).abs().mean()),
+        "hand_state": float(hands.double().mean()),
+        "count": float(len(rows)),
+    }
+
+
+@torch.no_grad()
+def codebook_use(tokenizer: MotionTokenizer, rows: NDArray[np.float32]) -> NDArray[np.int64]:
+    """How often each token occurs (vocabulary,) in windows (N, T, F)."""
+    parts = torch.from_numpy(rows).to(tokenizer.mean.device).split(256)
+    counts = sum(torch.bincount(tokenizer.encode(part).flatten(), minlength=tokenizer.cfg.vocabulary) for part in parts)
+    assert isinstance(counts, torch.Tensor)
+    return counts.cpu().numpy()
+
+
+def tokenizer_metrics(tokenizer: MotionTokenizer, windows: MotionWindows, seed: int = 0) -> dict[str, float]:
+    """Reconstruction of held-out clips and windows, `clips_…` and `windows_…`, and the use of the codes.
+
+    `codes_used` is the share of codes that occur in 512 training windows, `perplexity` the exponential of the entropy of their
+    use, both over the whole vocabulary; `bits_per_s` what the tokens of a second can tell at most.
     """
     rng = np.random.default_rng(seed)
     clips = [windows.clips.window(int(i), windows.frames, rng) for i in windows.clips.split.test for _ in range(4)]
     result: dict[str, float] = {}
-    used: set[int] = set()
-    for name, rows in (("clips", np.stack(clips) if clips else None), ("windows", windows.test[:512])):
-        if rows is None or len(rows) == 0:
-            continue
-        truth = torch.from_numpy(rows).to(tokenizer.mean.device)
-        ids = tokenizer.encode(truth)
-        used |= set(ids.flatten().tolist())
-        rebuilt = tokenizer.decode(ids)
-        keys = 3 * KEY_BODY_COUNT
-        error = (rebuilt[..., :keys] - truth[..., :keys]).unflatten(-1, (KEY_BODY_COUNT, 3)).norm(dim=-1)  # (B, T, K)
-        result[f"{name}_mpjpe_mm"] = 1000.0 * float(error.mean())
-        result[f"{name}_hands_feet_mm"] = 1000.0 * float(error[..., HANDS_AND_FEET].mean())
-        result[f"{name}_height_mm"] = 1000.0 * float((rebuilt[..., keys] - truth[..., keys]).abs().mean())
-        hands = (rebuilt[:, -1, HAND_OPENING] >= OPEN_HAND) == (truth[:, -1, HAND_OPENING] >= OPEN_HAND)
-        result[f"{name}_hand_state"] = float(hands.double().mean())
-        result[f"{name}_count"] = float(len(rows))
-    sample = torch.from_numpy(windows.draw(rng, 512)).to(tokenizer.mean.device)
-    counts = torch.bincount(tokenizer.encode(sample).flatten(), minlength=tokenizer.cfg.codes).double()
-    share = counts / counts.sum()
-    result["codes_used"] = float((counts > 0).double().mean())
-    result["perplexity"] = float(torch.exp(-(share[share > 0] * share[share > 0].log()).sum()))
-    return result
+    for name, rows in (("clips", np.stack(clips) if clips else windows.test[:0]), ("windows", windows.test[:512])):
+        if len(rows):
+            result |= {f"{name}_{key}": value for key, value in reconstruction_metrics(tokenizer, rows).items()}
+    counts = codebook_use(tokenizer, windows.draw(rng, 512))
+    share = counts[counts > 0] / counts.sum()
+    cfg = tokenizer.cfg
+    return result | {
+        "codes_used": float((counts > 0).mean()),
+        "perplexity": float(np.exp(-np.sum(share * np.log(share)))),
+        "bits_per_s": FPS / cfg.stride * cfg.codebooks * float(np.log2(cfg.codes)),
+    }

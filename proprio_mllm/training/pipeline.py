@@ -33,6 +33,7 @@ from proprio_mllm.training.loop import Objective, run_loop
 from proprio_mllm.training.metrics import MetricWriter
 from proprio_mllm.training.motion_stage import FEATURE_BIAS, MotionObjective, MotionWindows, tokenizer_metrics
 from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_key
+from proprio_mllm.training.reconstruction import render
 from proprio_mllm.training.rollouts import CorrectionRequest
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Judgements, Views, shard_hash
 from proprio_mllm.training.text import corpus, start_from_words, whole_words
@@ -280,6 +281,7 @@ class Pipeline:
         tokenizer.set_normalisation(*windows.statistics())
         self.loop(MotionObjective(tokenizer, windows, key), self.cfg.tokenizer, folder)
         tokenizer.eval().save(self.paths.model("tokenizer"))
+        render(tokenizer, clips, folder / "pictures")
         return tokenizer_metrics(tokenizer, windows)
 
     def _start_alignment(self) -> ProprioMLLM:

@@ -28,7 +28,7 @@ from sim.robots.spec import SIDES, BodyShape, RobotSpec
 if TYPE_CHECKING:
     from sim.robots.kinematics import RobotModel
 
-__all__ = ["SELF_TOUCH_M", "OwnBody", "SelfLimit", "default_shapes"]
+__all__ = ["SELF_TOUCH_M", "OwnBody", "SelfLimit", "default_shapes", "moved_by", "solid_on"]
 
 Array = NDArray[np.float64]
 
@@ -64,11 +64,8 @@ class OwnBody:
         arms = {side: {model.getJointId(name) for name in spec.arms[side].joints} for side in SIDES}
         members = {**arms, "legs": {model.getJointId(name) for name in spec.leg_joints}}
         for number, shape in enumerate(spec.self_shapes or default_shapes(spec)):
-            index = robot.frame_id(shape.body)
-            joint, body = model.frames[index].parentJoint, model.frames[index].placement
-            solid, at = _solid(shape)
-            self.geometry.addGeometryObject(pin.GeometryObject(f"{shape.body}_{number}", joint, index, body * at, solid))
-            above = set(model.supports[joint])
+            self.geometry.addGeometryObject(solid_on(robot, shape, f"{shape.body}_{number}"))
+            above = set(model.supports[self.geometry.geometryObjects[number].parentJoint])
             self.parts.append(next((part for part, joints in members.items() if joints & above), "trunk"))
         for a, first in enumerate(self.parts):
             for b, second in enumerate(self.parts):
@@ -159,7 +156,7 @@ class SelfLimit(Limit):
         self._results = [self._measured.distanceResults[index] for index in range(len(pairs))]
         joints = [shape.parentJoint for shape in geometry.geometryObjects]
         # (P, N) 1 where a joint moves a pair's first shape only, -1 where the second only
-        self._moves: Array = np.array([_supports(model, joints[a]) - _supports(model, joints[b]) for a, b in pairs])
+        self._moves: Array = np.array([moved_by(model, joints[a]) - moved_by(model, joints[b]) for a, b in pairs])
         self._at: Array | None = None
         self._clearance_m = _FAR_M
 
@@ -193,7 +190,15 @@ class SelfLimit(Limit):
         return (np.array(lines) @ self._data.J) * self._moves[close], np.array(bounds)
 
 
-def _supports(model: pin.Model, joint: int) -> Array:
+def solid_on(robot: RobotModel, shape: BodyShape, name: str) -> pin.GeometryObject:
+    """A shape as Pinocchio's geometry on the joint that moves its body."""
+    index = robot.frame_id(shape.body)
+    frame = robot.model.frames[index]
+    solid, at = _solid(shape)
+    return pin.GeometryObject(name, frame.parentJoint, index, frame.placement * at, solid)
+
+
+def moved_by(model: pin.Model, joint: int) -> Array:
     """(N,) 1 for the velocities that move a joint's body."""
     out = np.zeros(model.nv)
     for above in model.supports[joint]:

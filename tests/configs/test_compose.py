@@ -16,12 +16,16 @@ ROOTS = {"train": TrainConfig, "eval": EvalConfig}
 #: Which root a group belongs to; `contingency` is data that the simulator reads.
 GROUP_ROOT = {"model": "train", "budget": "train", "data": "train", "planner": "eval", "robot": "eval", "experiment": "eval"}
 #: What a user must add to a configuration that has no default for it.
-NEEDS = {"humanml3d": ("data.path=HumanML3D",)}
+NEEDS = {
+    "humanml3d": ("data.path=HumanML3D",),
+    "amass": ("data.path=AMASS", "data.body_models=models"),
+    "folder": ("data.path=motions",),
+}
 ALL = sorted(path.relative_to(CONFIG_DIR) for path in CONFIG_DIR.rglob("*.yaml"))
 
 
 def test_count() -> None:
-    assert len(ALL) == 27, f"configs/ holds {len(ALL)} YAML files: {[str(path) for path in ALL]}"
+    assert len(ALL) == 29, f"configs/ holds {len(ALL)} YAML files: {[str(path) for path in ALL]}"
     assert set(groups()) == {*GROUP_ROOT, "contingency"}
 
 

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from configs.schema.data import GateConfig
-from data.filter import apply_phc_list, automatic_rule, gate, phc_list
+from data.filter import admit, apply_phc_list, automatic_rule, gate, phc_list
 from data.generator import generate_clip
 from data.metrics import (
     Metrics,
     angle_deg,
     evaluate,
+    evaluate_joints,
     limit_violation_pct,
     saturation_pct,
     skate_cm_s,
@@ -17,6 +18,7 @@ from data.metrics import (
 from data.motion import N_FEATURES, decode_key_bodies, heading_to_world
 from data.omomo import find_demo_clips, load_mocap, load_omomo
 from data.retarget import MAX_JOINT_VELOCITY, Retargeted, Retargeter
+from data.retarget_report import PHYSICS, measure, table
 from data.retarget_report import main as report
 from data.skeleton import Caption, HumanMotion
 from sim.robots.spec import load_robot
@@ -113,6 +115,22 @@ def test_limits_and_saturation() -> None:
     assert saturation_pct(q, lower, upper) == 50.0
 
 
+def test_metrics_of_joints_without_targets(
+    retargeters: dict[str, Retargeter], results: dict[tuple[str, int], Retargeted]
+) -> None:
+    result = results["h1", 16]
+    root, q = result.motion.root_pose, result.motion.joint_positions
+    assert root is not None
+    assert q is not None
+    metrics = evaluate_joints(retargeters["h1"], root, q, result.source, result.targets.contact)
+    errors = ("hand_cm", "hand_p95_cm", "foot_cm", "foot_p95_cm")
+    assert np.isnan([getattr(metrics, name) for name in errors]).all()
+    known = evaluate(retargeters["h1"], result)
+    assert dataclasses.replace(metrics, **{name: getattr(known, name) for name in errors}) == known
+    with pytest.raises(ValueError, match=f"{len(root) - 1}, {len(q)}, "):
+        evaluate_joints(retargeters["h1"], root[1:], q, result.source, result.targets.contact)
+
+
 def test_mean_metrics(retargeters: dict[str, Retargeter], results: dict[tuple[str, int], Retargeted]) -> None:
     one = evaluate(retargeters["h1"], results["h1", 3])
     a = dataclasses.replace(one, hand_cm=1.0, balance_cm=float("nan"), frames=10)
@@ -131,6 +149,8 @@ def test_gates(retargeters: dict[str, Retargeter], results: dict[tuple[str, int]
     assert gate(metrics, high, 1.03, 20.0, GateConfig()) == ""
     assert gate(dataclasses.replace(metrics, skate_cm_s=20.0), high, 1.03, 20.0, GateConfig()) == "skate_cm_s 20.00 over 8"
     assert gate(dataclasses.replace(metrics, foot_cm=float("nan")), high, 1.03, 20.0, GateConfig()).startswith("foot_cm")
+    assert gate(dataclasses.replace(metrics, self_pct=10.0), high, 1.03, 20.0, GateConfig()) == ""
+    assert gate(dataclasses.replace(metrics, self_pct=12.0), high, 1.03, 20.0, GateConfig()) == "self_pct 12.00 over 10"
     low = high.copy()
     low[5:25] = 0.3
     assert gate(metrics, low, 1.03, 20.0, GateConfig()) == "pelvis below 0.5 of standing for 1.0 s"
@@ -165,11 +185,33 @@ def test_automatic_rule() -> None:
     assert "both feet above" in automatic_rule(HumanMotion("a", flying, 20.0))
 
 
+def test_admission() -> None:
+    clip = dataclasses.replace(generate_clip(0, 6), name="000013")
+    assert admit(clip, use_list=False) is clip
+    assert admit(clip, use_list=True) == "PHC list: airborne"
+    lifted = dataclasses.replace(clip, joints=clip.joints + np.array([0.0, 0.0, 0.2]))
+    assert str(admit(lifted, use_list=False)).startswith("starts 0.2")
+
+
 def test_report_usage(capsys: pytest.CaptureFixture[str]) -> None:
     assert report(["table"]) == 2
     assert "usage" in capsys.readouterr().err
+    assert report(["--physics"]) == 2
+    assert "[--physics]" in capsys.readouterr().err
     assert report(["report", "1"]) == 0
-    assert "skate_cm_s" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "skate_cm_s" in out and "physics" not in out
+
+
+def test_report_columns(retargeters: dict[str, Retargeter]) -> None:
+    clip = generate_clip(0, 6)
+    part = dataclasses.replace(clip, joints=clip.joints[:12], hand_opening=None)
+    plain, simulated = (measure("x1", retargeters["x1"], [part], physics) for physics in (False, True))
+    assert plain.physics is None and plain.metrics == simulated.metrics
+    assert simulated.physics is not None and simulated.physics.joint_deg < 4.0
+    labels = list(table([plain, simulated]).columns[0].cells)
+    assert labels[-5:] == [f"physics: {name}" for name in PHYSICS]
+    assert list(table([plain]).columns[0].cells)[-1] == "frames"
 
 
 @pytest.mark.motions

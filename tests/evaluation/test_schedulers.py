@@ -16,8 +16,9 @@ import pytest
 
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
+from data.cluster import import_ray, ray_instance
 from data.records import Camera, EpisodeRecord, Observation, Proprioception
-from proprio_mllm.evaluation.ray_pool import import_ray, ray_instance, ray_model, run_ray_jobs
+from proprio_mllm.evaluation.ray_pool import ray_model, run_ray_jobs
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.evaluation.serving import model_process
 from proprio_mllm.planners.protocol import Planner, TaskInfo

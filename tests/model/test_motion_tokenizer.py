@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,8 +7,9 @@ import torch
 from torch.nn import functional
 
 from configs.schema.model import MotionTokenizerConfig
+from configs.validate import ConfigError, build
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.quantizer import VectorQuantizer
+from proprio_mllm.model.quantizer import MotionQuantizer
 
 CFG = MotionTokenizerConfig(features=5, window=16, codes=12, code_dim=6, width=8, depth=2)
 
@@ -17,79 +19,160 @@ def _motion(batch: int = 4, frames: int = 16, seed: int = 0) -> torch.Tensor:
     return torch.randn(batch, frames, 5, generator=generator).cumsum(1) * 0.1
 
 
-def test_quantiser_against_a_loop():
+def _quantizer(**changes: object) -> MotionQuantizer:
+    sizes: dict[str, object] = {
+        "features": 5,
+        "window": 16,
+        "codes": 7,
+        "code_dim": 3,
+        "width": 8,
+        "depth": 2,
+        "reset_below": 0.0,
+    }
     torch.manual_seed(0)
-    quantiser = VectorQuantizer(7, 3, decay=0.9, reset_below=0.0)
-    vectors = torch.randn(20, 3)
-    quantiser.train()
-    quantiser(vectors)  # initialises
-    book, counts, sums = quantiser.codebook.clone(), quantiser.counts.clone(), quantiser.sums.clone()
-    more = torch.randn(2, 5, 3)
-    result = quantiser(more)
-    flat = more.reshape(-1, 3)
+    return MotionQuantizer(build(MotionTokenizerConfig, sizes | changes, "motion")).train()
+
+
+def _codebook(quantizer: MotionQuantizer) -> torch.Tensor:
+    return quantizer.inner.codebook
+
+
+def test_quantiser_against_the_papers_equations():
+    """Nearest code, both losses and the moving averages, computed with loops."""
+    decay = 0.9
+    quantizer = _quantizer(ema_decay=decay)
+    quantizer(torch.randn(1, 20, 3))  # initialises
+    book = _codebook(quantizer).clone()
+    inner = quantizer.inner._codebook
+    counts, sums = inner.cluster_size[0].clone(), inner.embed_avg[0].clone()
+    vectors = torch.randn(2, 5, 3, requires_grad=True)
+    result = quantizer(vectors)
+    flat = vectors.detach().reshape(-1, 3)
     nearest = [min(range(7), key=lambda k: float((v - book[k]).pow(2).sum())) for v in flat]
-    assert result.ids.flatten().tolist() == nearest
+    assert result.tokens.flatten().tolist() == nearest
     torch.testing.assert_close(result.vectors.detach().reshape(-1, 3), book[nearest])
-    assert float(result.commitment_loss) == pytest.approx(float((flat - book[nearest]).pow(2).mean()), rel=1e-5)
+    square = float((flat - book[nearest]).pow(2).mean())
+    assert float(result.commitment_loss.detach()) == pytest.approx(square, rel=1e-5)
+    assert float(result.codebook_loss) == pytest.approx(square, rel=1e-5)
+    result.commitment_loss.backward()
+    torch.testing.assert_close(vectors.grad.reshape(-1, 3), 2.0 * (flat - book[nearest]) / flat.numel())
     for k in range(7):
         own = [v for v, n in zip(flat, nearest, strict=True) if n == k]
-        counts[k] = 0.9 * counts[k] + 0.1 * len(own)
-        sums[k] = 0.9 * sums[k] + 0.1 * (torch.stack(own).sum(0) if own else torch.zeros(3))
-        torch.testing.assert_close(quantiser.codebook[k], sums[k] / counts[k])
+        counts[k] = decay * counts[k] + (1.0 - decay) * len(own)
+        sums[k] = decay * sums[k] + (1.0 - decay) * (torch.stack(own).sum(0) if own else torch.zeros(3))
+    torch.testing.assert_close(inner.cluster_size[0], counts)
+    smoothed = (counts + 1e-5) / (counts.sum() + 7e-5) * counts.sum()  # the library's, against division by zero
+    torch.testing.assert_close(_codebook(quantizer), sums / smoothed[:, None])
     share = torch.tensor([nearest.count(k) / 10 for k in range(7)])
     entropy = -(share[share > 0] * share[share > 0].log()).sum()
     assert float(result.perplexity) == pytest.approx(float(entropy.exp()), rel=1e-4)
 
 
+def test_residual_codebooks_quantise_what_is_left_over():
+    quantizer = _quantizer(quantizer="rvq", stages=2)
+    quantizer(torch.randn(1, 40, 3))
+    quantizer.eval()
+    vectors = torch.randn(1, 6, 3)
+    first, second = (layer.codebook for layer in quantizer.inner.layers)
+    for step, tokens in zip(vectors[0], quantizer.tokens(vectors)[0], strict=True):
+        one = int((step - first).pow(2).sum(1).argmin())
+        two = int((step - first[one] - second).pow(2).sum(1).argmin())
+        assert tokens.tolist() == [one, 7 + two]
+    one, two = quantizer.tokens(vectors)[0, 0].tolist()
+    torch.testing.assert_close(quantizer.lookup(quantizer.tokens(vectors))[0, 0], first[one] + second[two - 7])
+
+
+def test_grid_tokens_are_the_rounded_values():
+    quantizer = _quantizer(quantizer="fsq", codes=60, levels=(5, 4, 3)).eval()
+    vectors = torch.randn(2, 9, 3)
+    tokens = quantizer.tokens(vectors)
+    assert tokens.shape == (2, 9, 1) and int(tokens.max()) < 60
+    torch.testing.assert_close(quantizer.lookup(tokens), quantizer(vectors).vectors)
+    with pytest.raises(ValueError, match="make 64 codes, not codes 7"):
+        _quantizer(quantizer="fsq", levels=(4, 4, 4))
+
+
 def test_dead_codes_come_back_as_vectors_of_the_batch():
-    quantiser = VectorQuantizer(4, 2, reset_below=1.0).train()
-    quantiser(torch.randn(8, 2, generator=torch.Generator().manual_seed(0)))
-    quantiser.counts[2] = 0.5
-    quantiser.codebook[2] = 1e6
-    batch = torch.randn(8, 2, generator=torch.Generator().manual_seed(1))
-    quantiser(batch, torch.Generator().manual_seed(2))
-    assert any(torch.equal(quantiser.codebook[2], vector) for vector in batch)
-    assert quantiser.counts[2] == 1
+    quantizer = _quantizer(reset_below=1.0)
+    quantizer(torch.randn(1, 30, 3), torch.Generator().manual_seed(0))
+    inner = quantizer.inner._codebook
+    inner.cluster_size[0, 2] = 0.5
+    inner.embed[0, 2] = inner.embed_avg[0, 2] = 1e6
+    batch = torch.randn(1, 30, 3)
+    quantizer(batch, torch.Generator().manual_seed(2))
+    assert any(torch.equal(_codebook(quantizer)[2], vector) for vector in batch[0])
+
+
+def test_draws_follow_the_generator_and_leave_torchs_own_alone():
+    books = []
+    for other in (1, 2):
+        quantizer = _quantizer()
+        torch.manual_seed(other)
+        before = torch.get_rng_state()
+        quantizer(torch.randn(1, 30, 3, generator=torch.Generator().manual_seed(5)), torch.Generator().manual_seed(7))
+        assert torch.equal(torch.get_rng_state(), before)
+        books.append(_codebook(quantizer).clone())
+    assert torch.equal(*books)
 
 
 def test_straight_through_gradient_and_frozen_codebook_in_eval():
-    quantiser = VectorQuantizer(4, 2).train()
-    quantiser(torch.randn(8, 2))
-    before = quantiser.codebook.clone()
-    vectors = torch.randn(3, 2, requires_grad=True)
-    quantiser.eval()(vectors).vectors.sum().backward()
-    assert torch.equal(vectors.grad, torch.ones(3, 2))
-    assert torch.equal(quantiser.codebook, before)
+    for kind in ("vq", "rvq"):
+        quantizer = _quantizer(quantizer=kind)
+        quantizer(torch.randn(1, 30, 3))
+        vectors = torch.randn(1, 3, 3, requires_grad=True)
+        quantizer(vectors).vectors.sum().backward()
+        torch.testing.assert_close(vectors.grad, torch.ones(1, 3, 3))
+        state = {name: value.clone() for name, value in quantizer.eval().state_dict().items()}
+        quantizer(torch.randn(1, 30, 3))
+        assert all(torch.equal(value, state[name]) for name, value in quantizer.state_dict().items())
 
 
 def test_small_batches_fill_a_large_codebook():
-    quantiser = VectorQuantizer(16, 2).train()
-    quantiser(torch.randn(3, 2))
-    assert len(torch.unique(quantiser.codebook, dim=0)) == 16
+    quantizer = _quantizer(codes=16, reset_below=1.0)
+    for _ in range(3):
+        quantizer(torch.randn(1, 20, 3))
+    assert len(torch.unique(_codebook(quantizer), dim=0)) > 12
 
 
 def test_gradient_rule_trains_the_codebook():
-    quantiser = VectorQuantizer(4, 2, update="grad", reset_below=0.0).train()
-    quantiser(torch.randn(8, 2)).codebook_loss.backward()
-    assert quantiser.codebook.grad.abs().sum() > 0
-    with pytest.raises(ValueError, match="update 'x'"):
-        VectorQuantizer(4, 2, update="x")
+    quantizer = _quantizer(update="grad")
+    vectors = torch.randn(1, 8, 3)
+    result = quantizer(vectors)
+    result.codebook_loss.backward()
+    book = quantizer.inner._codebook.embed
+    chosen = result.tokens.flatten()
+    expected = torch.zeros_like(book[0])
+    expected.index_add_(0, chosen, 2.0 * (book[0].detach()[chosen] - vectors[0]) / vectors.numel())
+    torch.testing.assert_close(book.grad[0], expected)
+    with pytest.raises(ConfigError, match="update"):
+        _quantizer(update="x")
+    with pytest.raises(ValueError, match="update 'grad' is for quantizer vq, not rvq"):
+        _quantizer(update="grad", quantizer="rvq")
 
 
-def test_codes_outside_the_codebook_are_refused():
-    with pytest.raises(ValueError, match=r"outside the codebook \[0, 4\)"):
-        VectorQuantizer(4, 2).lookup(torch.tensor([4]))
+def test_tokens_outside_the_codebook_are_refused():
+    with pytest.raises(ValueError, match=r"motion token 7 outside the codebook \[0, 7\)"):
+        _quantizer().lookup(torch.tensor([[[7]]]))
+    with pytest.raises(ValueError, match=r"motion token 3 outside the codebook \[7, 14\)"):
+        _quantizer(quantizer="rvq").lookup(torch.tensor([[[3, 3]]]))
+    with pytest.raises(ValueError, match="3 tokens; expected a multiple of 2"):
+        MotionTokenizer(replace(CFG, quantizer="rvq")).decode(torch.zeros(1, 3, dtype=torch.long))
+
+
+def _spread(tokenizer: MotionTokenizer) -> MotionTokenizer:
+    """In evaluation mode, with codes that have seen something."""
+    tokenizer.train()(_motion(32), torch.Generator().manual_seed(0))
+    return tokenizer.eval()
 
 
 def test_loss_is_the_papers_sum():
-    tokenizer = MotionTokenizer(CFG).eval()
-    tokenizer.quantizer.codebook.normal_()
+    tokenizer = _spread(MotionTokenizer(CFG))
     tokenizer.set_normalisation(np.arange(5) / 10, np.full(5, 0.5))
     motion = _motion()
     loss = tokenizer(motion)
     normal = (motion - torch.arange(5) / 10) / 0.5
     encoded = tokenizer.encoder(normal.transpose(1, 2)).transpose(1, 2)
-    chosen = tokenizer.quantizer.codebook[tokenizer.encode(motion)]
+    chosen = _codebook(tokenizer.quantizer)[tokenizer.encode(motion)]
     rebuilt = tokenizer.decoder(chosen.transpose(1, 2)).transpose(1, 2)
     expected = (
         functional.smooth_l1_loss(rebuilt, normal)
@@ -117,9 +200,10 @@ def test_learns_and_uses_several_codes():
     assert loss.perplexity > 3
 
 
-def test_online_equals_offline():
-    tokenizer = MotionTokenizer(CFG).eval()
-    tokenizer.quantizer.codebook.normal_()
+@pytest.mark.parametrize("kind", ["vq", "rvq", "fsq"])
+def test_online_equals_offline(kind):
+    tokenizer = _spread(MotionTokenizer(replace(CFG, quantizer=kind, codes=64 if kind == "fsq" else 12, levels=(4, 4, 4))))
+    steps = tokenizer.cfg.codebooks
     long = _motion(1, 40)[0].numpy()
     offline = tokenizer.encode(torch.from_numpy(np.stack([long[k : k + 16] for k in range(20)])))
     for k in range(20):
@@ -127,7 +211,8 @@ def test_online_equals_offline():
     short = tokenizer.encode_window(long[:3])
     padded = np.concatenate([np.repeat(long[:1], 13, axis=0), long[:3]])
     assert short == tokenizer.encode_window(padded)
-    assert len(short) == CFG.window_tokens == 4
+    assert len(short) == tokenizer.cfg.window_tokens == 4 * steps
+    assert torch.equal(tokenizer.decode(offline), tokenizer.eval().decode(offline))
 
 
 def test_round_trip_continues_training_alike(tmp_path):

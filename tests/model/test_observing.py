@@ -20,7 +20,7 @@ def observation(examples) -> Observation:
 
 def test_observation_becomes_prompt_and_view(cfg, build, observation):
     tokenizer = MotionTokenizer(cfg.motion).eval()
-    tokenizer.quantizer.codebook.normal_()
+    tokenizer.quantizer.inner._codebook.embed.normal_()
     example = plan_example(observation, cfg, tokenizer)
     codes = tokenizer.encode_window(observation.proprioception.motion)
     assert example.messages[-1].text == f"{motion_text(codes)}h1 2/9 tidy up\nsee Mug_1\nknow Pan_1\ndid\nGoTo(Mug_1) ok"

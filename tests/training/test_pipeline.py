@@ -153,7 +153,9 @@ def test_metrics_are_reported(trained: Pipeline) -> None:
         "exercises": 10.0, "exercise_steps": 12.0, "seconds": 0,
     }  # fmt: skip
     assert metrics("pointmap")["point_median_m"] > 0.0
-    assert {"clips_mpjpe_mm", "clips_hands_feet_mm", "codes_used", "perplexity"} <= set(metrics("tokenizer"))
+    assert {"clips_mpjpe_mm", "clips_hands_mm", "clips_feet_mm", "bits_per_s", "codes_used", "perplexity"} <= set(
+        metrics("tokenizer")
+    )
     assert {"arm_accuracy", "shift_accuracy", "plan_exact"} <= set(metrics("alignment"))
 
 
