@@ -357,22 +357,31 @@ def pull(script: Script) -> Phrases:
     ]
 
 
-def open_door(script: Script) -> Phrases:
-    """Swings a door open: the hand follows an arc about a hinge on its own side."""
-    side = int(script.rng.integers(2))
+def _door_arc(script: Script, side: int, start_rad: float, end_rad: float) -> tuple[str, list[Array]]:
+    """The name of a height, and points of a door's handle about a hinge on the hand's own side; 0 is shut."""
     sign = 1.0 if side == 0 else -1.0
     height = _choice(script, ["at waist height", "at chest height"])
     z = float(script.rng.uniform(*HEIGHTS[height]))
     hinge, radius = np.array([0.5, 0.42 * sign]), 0.4
+    angles = np.linspace(start_rad, end_rad, 5)
+    return height, [np.array([hinge[0] - radius * np.sin(a), hinge[1] - sign * radius * np.cos(a), z]) for a in angles]
+
+
+def _sweep(script: Script, side: int, wrists: list[Array], seconds: float) -> None:
+    """Leads one hand through points in one sweep."""
+    script.hand_path(side, wrists, seconds)
+    script.time_s += seconds
+
+
+def open_door(script: Script) -> Phrases:
+    """Swings a door open: the hand follows an arc about a hinge on its own side."""
+    side = int(script.rng.integers(2))
+    height, arc = _door_arc(script, side, 0.0, 0.8)
     script.grip(side, 1.0)
-    arc = [np.array([hinge[0] - radius * np.sin(a), hinge[1] - sign * radius * np.cos(a), z]) for a in np.linspace(0.0, 0.8, 5)]
     _go(script, {side: arc[0]}, float(script.rng.uniform(0.8, 1.1)))
     script.grip(side, 0.1)
     script.wait(0.3)
-    start = script.time_s
-    total = float(script.rng.uniform(1.1, 1.6))
-    script.hand_path(side, arc, total)
-    script.time_s = start + total
+    _sweep(script, side, arc, float(script.rng.uniform(1.1, 1.6)))
     script.grip(side, 0.7)
     script.wait(0.2)
     script.hand(side, None, 0.9, advance=False)
@@ -384,18 +393,10 @@ def open_door(script: Script) -> Phrases:
 def close_door(script: Script) -> Phrases:
     """Pushes a door shut along its arc."""
     side = int(script.rng.integers(2))
-    sign = 1.0 if side == 0 else -1.0
-    height = _choice(script, ["at waist height", "at chest height"])
-    z = float(script.rng.uniform(*HEIGHTS[height]))
-    hinge, radius = np.array([0.5, 0.42 * sign]), 0.4
-    arc = [
-        np.array([hinge[0] - radius * np.sin(a), hinge[1] - sign * radius * np.cos(a), z]) for a in np.linspace(0.8, 0.05, 5)
-    ]
+    height, arc = _door_arc(script, side, 0.8, 0.05)
     script.grip(side, 0.5)
     _go(script, {side: arc[0]}, float(script.rng.uniform(0.8, 1.1)))
-    start, total = script.time_s, float(script.rng.uniform(0.9, 1.4))
-    script.hand_path(side, arc, total)
-    script.time_s = start + total
+    _sweep(script, side, arc, float(script.rng.uniform(0.9, 1.4)))
     script.wait(0.2)
     script.hand(side, None, 0.9, advance=False)
     _stand(script, 0.9)

@@ -40,18 +40,6 @@ _CHUNK: Final = 4096
 _SMPLX_FEW: Final = (300, 10)
 
 
-def requirerequire_smplx() -> Any:
-    """The module of `smplx` with the kinematic functions.
-
-    Raises:
-        DatasetError: when it is not installed; the message names the extra.
-    """
-    try:
-        return importlib.import_module("smplx.lbs")
-    except ImportError as error:
-        raise DatasetError("AMASS needs smplx, which is not installed: pip install 'proprio-mllm[motion]'") from error
-
-
 def require_smplx() -> Any:
     """The module of `smplx` with the kinematic functions.
 
