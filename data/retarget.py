@@ -32,7 +32,7 @@ from data.skeleton import HumanMotion
 from data.targets import Measures, Targets, make_targets
 from sim.robots.kinematics import RobotModel
 from sim.robots.leg_ik import crouch
-from sim.robots.self_collision import default_shapes, moved_by, solid_on
+from sim.robots.self_collision import close_rows, default_shapes, moved_by, solid_on
 from sim.robots.spec import SIDES, RobotSpec
 
 __all__ = ["MAX_JOINT_VELOCITY", "Measured", "Retargeted", "Retargeter"]
@@ -324,14 +324,8 @@ class _Apart:
         pin.updateGeometryPlacements(self._model, data, self._shapes, self._gaps)
         if self._results[pin.computeDistances(self._shapes, self._gaps)].min_distance >= _APART_M:
             return None
-        close, lines, short = [], [], []
-        for index, result in enumerate(self._results):
-            if result.min_distance < _APART_M:
-                (x, y, z), (u, v, w) = result.getNearestPoint1().tolist(), result.normal.tolist()
-                close.append(index)
-                lines.append((u, v, w, y * w - z * v, z * u - x * w, x * v - y * u))
-                short.append(max(result.min_distance - _APART_M, -_DEEPEST_M))
-        return -(np.array(lines) @ data.J) * self._moves[close], np.array(short)
+        rows, gaps = close_rows(self._results, data, self._moves, _APART_M)
+        return -rows, np.maximum(gaps - _APART_M, -_DEEPEST_M)
 
 
 def _leg_side(robot: RobotModel, joint: int) -> str:

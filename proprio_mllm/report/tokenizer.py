@@ -32,7 +32,7 @@ from data.retarget import Retargeter
 from data.shards import ShardError
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.report.arguments import read_named
-from proprio_mllm.training.motion_stage import codebook_use, reconstruction_metrics
+from proprio_mllm.training.motion_stage import bits_per_s, codebook_use, perplexity, reconstruction_metrics
 from proprio_mllm.training.reconstruction import draw_use
 from proprio_mllm.training.sources import Clips
 from sim.robots.spec import available_robots, load_robot
@@ -163,17 +163,15 @@ def table(rows: Sequence[Row]) -> str:
     lines = ["| " + " | ".join(_HEADINGS) + " |", "|" + "---|" * len(_HEADINGS)]
     for row in rows:
         cfg, m = row.tokenizer.cfg, row.metrics
-        share = row.use[row.use > 0] / max(row.use.sum(), 1)
-        bits = 20.0 / cfg.stride * cfg.codebooks * np.log2(cfg.codes)
         cells = [
             row.name,
             f"{cfg.quantizer} {cfg.codebooks} × {cfg.codes}",
-            f"{bits:.0f}",
+            f"{bits_per_s(cfg):.0f}",
             f"{row.clips} ({m['count']:.0f} windows)",
             *(f"{m[key]:.1f}" for key in ("mpjpe_mm", "hands_mm", "feet_mm", "velocity_mm_s")),
             ", ".join(f"{robot} {error:.1f}" for robot, error in row.joints_deg.items()),
             f"{100.0 * float((row.use > 0).mean()):.0f}",
-            f"{float(np.exp(-np.sum(share * np.log(share)))):.0f}",
+            f"{perplexity(row.use):.0f}",
             f"{row.ms:.2f}",
         ]
         lines.append("| " + " | ".join(cells) + " |")
@@ -194,10 +192,13 @@ def main(arguments: Sequence[str]) -> int:
         return 1
     solvers = {robot: JointAngles(load_robot(robot)) for robot in available_robots()}
     rows: list[Row] = []
+    windows: dict[int, dict[str, dict[str, NDArray[np.float32]]]] = {}  # by window length: real clips are slow to retarget
     for name, tokenizer in tokenizers.items():
         frames = tokenizer.cfg.window
-        kinds = {"generated": _held_out(clips, frames), "real": real_windows(frames)}
-        rows += evaluate_tokenizer(name, tokenizer, {kind: windows for kind, windows in kinds.items() if windows}, solvers)
+        if frames not in windows:
+            windows[frames] = {"generated": _held_out(clips, frames), "real": real_windows(frames)}
+        kinds = windows[frames]
+        rows += evaluate_tokenizer(name, tokenizer, {kind: found for kind, found in kinds.items() if found}, solvers)
     text = table(rows)
     sys.stdout.write(text)
     if not any(row.clips == "real" for row in rows):

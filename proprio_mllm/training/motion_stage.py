@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from configs.schema.model import MotionTokenizerConfig
 from data.motion import FPS, HAND_OPENING, KEY_BODY_COUNT, N_FEATURES, OPEN_HAND, PELVIS_HEIGHT
 from proprio_mllm.model.geometry import KEY_BODIES
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
@@ -26,7 +27,9 @@ __all__ = [
     "FEATURE_BIAS",
     "MotionObjective",
     "MotionWindows",
+    "bits_per_s",
     "codebook_use",
+    "perplexity",
     "reconstruction_metrics",
     "tokenizer_metrics",
 ]
@@ -130,6 +133,17 @@ def codebook_use(tokenizer: MotionTokenizer, rows: NDArray[np.float32]) -> NDArr
     return counts.cpu().numpy()
 
 
+def perplexity(counts: NDArray[np.int64]) -> float:
+    """Exponential of the entropy of token counts (vocabulary,)."""
+    share = counts[counts > 0] / counts.sum()
+    return float(np.exp(-np.sum(share * np.log(share))))
+
+
+def bits_per_s(cfg: MotionTokenizerConfig) -> float:
+    """What the tokens of a second can tell at most."""
+    return FPS / cfg.stride * cfg.codebooks * float(np.log2(cfg.codes))
+
+
 def tokenizer_metrics(tokenizer: MotionTokenizer, windows: MotionWindows, seed: int = 0) -> dict[str, float]:
     """Reconstruction of held-out clips and windows, `clips_…` and `windows_…`, and the use of the codes.
 
@@ -143,10 +157,8 @@ def tokenizer_metrics(tokenizer: MotionTokenizer, windows: MotionWindows, seed: 
         if len(rows):
             result |= {f"{name}_{key}": value for key, value in reconstruction_metrics(tokenizer, rows).items()}
     counts = codebook_use(tokenizer, windows.draw(rng, 512))
-    share = counts[counts > 0] / counts.sum()
-    cfg = tokenizer.cfg
     return result | {
         "codes_used": float((counts > 0).mean()),
-        "perplexity": float(np.exp(-np.sum(share * np.log(share)))),
-        "bits_per_s": FPS / cfg.stride * cfg.codebooks * float(np.log2(cfg.codes)),
+        "perplexity": perplexity(counts),
+        "bits_per_s": bits_per_s(tokenizer.cfg),
     }

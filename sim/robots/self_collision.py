@@ -28,7 +28,7 @@ from sim.robots.spec import SIDES, BodyShape, RobotSpec
 if TYPE_CHECKING:
     from sim.robots.kinematics import RobotModel
 
-__all__ = ["SELF_TOUCH_M", "OwnBody", "SelfLimit", "default_shapes", "moved_by", "solid_on"]
+__all__ = ["SELF_TOUCH_M", "OwnBody", "SelfLimit", "close_rows", "default_shapes", "moved_by", "solid_on"]
 
 Array = NDArray[np.float64]
 
@@ -173,21 +173,33 @@ class SelfLimit(Limit):
         return self._clearance_m
 
     def compute_qp_inequalities(self, configuration: pink.Configuration, dt: float) -> tuple[Array, Array] | None:
-        """See `pink.limits.Limit`.
-
-        Both nearest points lie on one line along the normal, so that one wrench on it tells how fast either moves.
-        """
+        """See `pink.limits.Limit`."""
         if self.clearance_m(configuration) > _NEAR_M:
             return None
-        close, lines, bounds = [], [], []
-        for index, result in enumerate(self._results):  # numbers one by one: arrays of three cost more than what they save
-            distance = result.min_distance
-            if distance < _NEAR_M:
-                (x, y, z), (u, v, w) = result.getNearestPoint1().tolist(), result.normal.tolist()
-                close.append(index)
-                lines.append((u, v, w, y * w - z * v, z * u - x * w, x * v - y * u))
-                bounds.append(max(_GAIN * (distance - _KEEP_M), -_ESCAPE_M))
-        return (np.array(lines) @ self._data.J) * self._moves[close], np.array(bounds)
+        rows, gaps = close_rows(self._results, self._data, self._moves, _NEAR_M)
+        return rows, np.maximum(_GAIN * (gaps - _KEEP_M), -_ESCAPE_M)
+
+
+def close_rows(results: Sequence[Any], data: pin.Data, moves: Array, near_m: float) -> tuple[Array, Array]:
+    """How the pairs nearer than `near_m` come closer: rows n^T (J_a(p_a) - J_b(p_b)) (P, N) and distances (P,).
+
+    Both nearest points lie on one line along the normal, so that one wrench on it tells how fast either moves.
+
+    Args:
+        results: measured distances of all pairs.
+        data: of the model, with joint Jacobians in the world frame.
+        moves: (all pairs, N) 1 where a joint moves a pair's first shape only, -1 where the second only.
+        near_m: distance from which on a pair is left out.
+    """
+    close, lines, gaps = [], [], []
+    for index, result in enumerate(results):  # numbers one by one: arrays of three cost more than what they save
+        distance = result.min_distance
+        if distance < near_m:
+            (x, y, z), (u, v, w) = result.getNearestPoint1().tolist(), result.normal.tolist()
+            close.append(index)
+            lines.append((u, v, w, y * w - z * v, z * u - x * w, x * v - y * u))
+            gaps.append(distance)
+    return (np.array(lines) @ data.J) * moves[close], np.array(gaps)
 
 
 def solid_on(robot: RobotModel, shape: BodyShape, name: str) -> pin.GeometryObject:

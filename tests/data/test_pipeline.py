@@ -105,7 +105,6 @@ def test_replay_configuration_is_checked(values: dict, message: str) -> None:
 
 
 def test_ray_writes_what_one_process_writes(tmp_path: Path) -> None:
-    pytest.importorskip("ray")
     serial = build_clips(CFG, tmp_path / "serial", picture)
     cfg = dataclasses.replace(CFG, workers=2, scheduler="ray")
     assert build_clips(cfg, tmp_path / "ray", picture).parts == serial.parts
