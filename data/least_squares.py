@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.linalg.lapack import get_lapack_funcs
 
 __all__ = ["BoundedSearch", "System"]
 
@@ -23,6 +24,7 @@ Array = NDArray[np.float64]
 System = Callable[[Array], tuple[Array, Array]]
 _EASE: Final = 0.3
 _TIGHTEN: Final = 10.0
+(_posv,) = get_lapack_funcs(("posv",), dtype=np.float64)
 #: Share of the cost that a step has to take off for another one to be worth it.
 _LEAST_GAIN: Final = 1e-3
 
@@ -50,6 +52,7 @@ class BoundedSearch:
     ) -> None:
         self._model, self._q, self._v = model, q_columns, v_columns
         self._prior, self._rest, self._damping = prior, rest, damping
+        self._prior_curvature = np.concatenate([np.zeros(6), prior**2])
 
     def __call__(self, q: Array, system: System, lower: Array, upper: Array, iterations: int) -> Array:
         """The best configuration found.
@@ -64,7 +67,8 @@ class BoundedSearch:
         best, damping, cost = q, self._damping, np.inf
         hessian = gradient = np.empty(0)
         width = len(self._v)
-        for _ in range(iterations):
+        diagonal = slice(0, None, width + 1)
+        for left in range(iterations - 1, -1, -1):
             jacobian, residual = system(q)
             away = self._prior * (q[self._q] - self._rest)
             new = float(residual @ residual + away @ away)
@@ -73,35 +77,49 @@ class BoundedSearch:
                 if gained < _LEAST_GAIN * cost:
                     break
                 damping = max(damping * _EASE, self._damping)
+            else:
+                damping *= _TIGHTEN
+            if not left:  # a step that nobody would look at
+                break
+            if best is q:
                 hessian = jacobian.T @ jacobian
                 gradient = jacobian.T @ residual
                 gradient[6:] += self._prior * away
-                hessian.flat[6 * width + 6 :: width + 1] += self._prior**2
-            else:
-                damping *= _TIGHTEN
+                hessian.flat[diagonal] += self._prior_curvature
             damped = hessian.copy()
-            damped.flat[:: width + 1] += damping
+            damped.flat[diagonal] += damping
             here = best[self._q]
             step = np.zeros(self._model.nv)
             step[self._v] = bounded_step(damped, gradient, lower - here, upper - here)
             q = pin.integrate(self._model, best, step)
-            q[self._q] = np.clip(q[self._q], lower, upper)
+            q[self._q] = np.minimum(np.maximum(q[self._q], lower), upper)
         return best
 
 
 def bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) -> Array:
     """Newton step whose joint part (all but the first six entries) stays within bounds; joints that would leave are held."""
-    step: Array = -np.linalg.solve(hessian, gradient).astype(np.float64)
+    step = _solve(hessian, -gradient)
     held = np.zeros(len(step), dtype=bool)
     for _ in range(3):
         joints = step[6:]
-        outside = np.concatenate([np.zeros(6, dtype=bool), (joints < lower - 1e-12) | (joints > upper + 1e-12)])
+        outside = (joints < lower - 1e-12) | (joints > upper + 1e-12)
         if not outside.any():
             break
-        held |= outside
-        step[6:] = np.clip(joints, lower, upper)
-        free = ~held
-        right = -gradient[free] - hessian[np.ix_(free, held)] @ step[held]
-        step[free] = np.linalg.solve(hessian[np.ix_(free, free)], right)
-    step[6:] = np.clip(step[6:], lower, upper)
+        held[6:] |= outside
+        step[6:] = np.minimum(np.maximum(joints, lower), upper)
+        fixed = np.where(held, step, 0.0)
+        right = np.where(held, step, -gradient - hessian @ fixed)
+        rest = hessian.copy()
+        rest[held] = rest[:, held] = 0.0
+        rest.flat[:: len(step) + 1] += held  # those rows say that held joints keep their value
+        step = _solve(rest, right)
+    step[6:] = np.minimum(np.maximum(step[6:], lower), upper)
     return step
+
+
+def _solve(matrix: Array, right: Array) -> Array:
+    """Solution for a positive definite matrix; LAPACK as it is, whose wrappers would cost more than the work."""
+    _, solution, info = _posv(matrix, right)
+    if info:
+        raise np.linalg.LinAlgError(f"the damped normal equations are not positive definite (dposv: {info})")
+    return solution

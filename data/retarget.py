@@ -24,16 +24,16 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from data.least_squares import BoundedSearch
+from data.least_squares import BoundedSearch, System
 from data.motion import FPS, encode_frames, resample
 from data.records import Motion
+from data.residuals import BodyFrames, Residuals, wrist_frame
 from data.self_contact import SelfContact
 from data.skeleton import HumanMotion
 from data.targets import Measures, Targets, make_targets
 from sim.robots.kinematics import RobotModel
 from sim.robots.leg_ik import crouch
-from sim.robots.self_collision import close_rows, default_shapes, moved_by, solid_on
-from sim.robots.spec import SIDES, RobotSpec
+from sim.robots.spec import RobotSpec
 
 __all__ = ["MAX_JOINT_VELOCITY", "Measured", "Retargeted", "Retargeter"]
 
@@ -45,19 +45,7 @@ _LEAST_KNEE_RAD: Final = 0.05
 _DAMPING: Final = 0.3
 _POSTURE_WEIGHT: Final = 0.03
 _HIP_YAW_WEIGHT: Final = 0.12
-_WEIGHTS: Final = {
-    "sole": 20.0,
-    "sole_rotation": 3.0,
-    "pelvis": 6.0,
-    "pelvis_rotation": 2.0,
-    "arm": 4.0,
-    "shoulders": 2.0,
-    "floor": 20.0,
-    "apart": 20.0,
-}
 _DEFAULT_OPENING: Final = 0.6
-_APART_M: Final = 0.01
-_DEEPEST_M: Final = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,11 +114,15 @@ class Retargeter:
         self._pelvis = frame(spec.root_body)
         self._soles = [frame(f"{side}_sole") for side in ("left", "right")]
         self._arm_frames = [
-            (frame(keys[f"{side}_shoulder"]), frame(keys[f"{side}_elbow"]), self._wrist_frame(side))
+            (frame(keys[f"{side}_shoulder"]), frame(keys[f"{side}_elbow"]), wrist_frame(self.robot, side))
             for side in ("left", "right")
         ]
-        self._apart = _Apart(self.robot)
         self._measure()
+        left, right = self._arm_frames
+        frames = BodyFrames(
+            self._pelvis, (self._soles[0], self._soles[1]), (left, right), self.measures.sole_level, self._corners
+        )
+        self._residuals = Residuals(self.robot, frames, self._v_columns)
         self._search = BoundedSearch(
             model, self._q_columns, self._v_columns, self._prior, self._reference[self._q_columns], _DAMPING
         )
@@ -139,11 +131,6 @@ class Retargeter:
     def self_contact(self) -> SelfContact:
         """Depth of the robot's contacts with itself."""
         return SelfContact(self.robot)
-
-    def _wrist_frame(self, side: str) -> int:
-        joint = self.robot.model.getJointId(self.spec.arms[side].joints[-1])
-        frames = self.robot.model.frames
-        return next(i for i, f in enumerate(frames) if f.type == pin.FrameType.JOINT and f.parentJoint == joint)
 
     def _measure(self) -> None:
         model, data = self.robot.model, self.robot.data
@@ -183,8 +170,8 @@ class Retargeter:
         q[3:7] = pin.Quaternion(targets.pelvis_rotation[0]).coeffs()
         root, joints = np.empty((frames, 7)), np.empty((frames, len(self.robot.joint_names)))
         keys = np.empty((frames, 14, 3))
-        for t in range(frames):
-            q = self._solve(q, targets, t)
+        for t, system in enumerate(self._residuals.follow(targets)):
+            q = self._solve(q, system, t == 0)
             root[t] = q[[0, 1, 2, 6, 3, 4, 5]]
             joints[t] = self._with_hands(q, opening[t])
             keys[t] = self.robot.key_body_positions(root[t], joints[t])
@@ -231,109 +218,12 @@ class Retargeter:
             joints[self.robot.indices(spec.hand_joints)] = hand
         return joints
 
-    def _solve(self, q: Array, targets: Targets, t: int) -> Array:
+    def _solve(self, q: Array, system: System, first: bool) -> Array:
         lower, upper = self._lower, self._upper
-        if t > 0:
+        if not first:
             step = MAX_JOINT_VELOCITY / FPS * 0.999
             lower, upper = np.maximum(lower, q[self._q_columns] - step), np.minimum(upper, q[self._q_columns] + step)
-        iterations = _FIRST_ITERATIONS if t == 0 else self.iterations
-        return self._search(q, lambda at: self._system(at, targets, t), lower, upper, iterations)
-
-    def _system(self, q: Array, targets: Targets, t: int) -> tuple[Array, Array]:
-        model, data = self.robot.model, self.robot.data
-        pin.computeJointJacobians(model, data, q)
-        pin.updateFramePlacements(model, data)
-        rows: list[Array] = []
-        residuals: list[Array] = []
-
-        def jacobian(frame: int) -> Array:
-            return pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:, self._v_columns]
-
-        def add(J: Array, r: Array, weight: float) -> None:
-            rows.append(J * weight)
-            residuals.append(r * weight)
-
-        def add_pose(frame: int, place: Array, rotation: Array, w_place: float, w_rotation: float) -> None:
-            J, pose = jacobian(frame), data.oMf[frame]
-            add(J[:3], pose.translation - place, w_place)
-            add(J[3:], pin.log3(pose.rotation @ rotation.T), w_rotation)
-
-        w = _WEIGHTS
-        add_pose(self._pelvis, targets.pelvis[t], targets.pelvis_rotation[t], w["pelvis"], w["pelvis_rotation"])
-        for foot in (0, 1):
-            add_pose(self._soles[foot], targets.soles[t, foot], targets.sole_rotation[t, foot], w["sole"], w["sole_rotation"])
-            J, pose = jacobian(self._soles[foot]), data.oMf[self._soles[foot]]
-            arms = self._corners @ (pose.rotation @ self._sole_level[foot].T).T  # (4, 3) from the sole to its corners
-            below = pose.translation[2] + arms[:, 2]
-            for corner in np.flatnonzero(below < 0.0):
-                add((J[2] + J[3] * arms[corner, 1] - J[4] * arms[corner, 0])[None], below[corner : corner + 1], w["floor"])
-        shoulder_jacobians = []
-        for arm, (shoulder, elbow, wrist) in enumerate(self._arm_frames):
-            J_s, J_e, J_w = (jacobian(frame)[:3] for frame in (shoulder, elbow, wrist))
-            p_s, p_e, p_w = (data.oMf[frame].translation for frame in (shoulder, elbow, wrist))
-            add(J_e - J_s, p_e - p_s - targets.arms[t, arm, 0], w["arm"])
-            add(J_w - J_s, p_w - p_s - targets.arms[t, arm].sum(axis=0), 2.0 * w["arm"])
-            shoulder_jacobians.append((J_s, p_s.copy()))
-        (J_l, p_l), (J_r, p_r) = shoulder_jacobians
-        add(J_l - J_r, p_l - p_r - targets.shoulders[t], w["shoulders"])
-        close = self._apart.rows(data)
-        if close is not None:
-            add(close[0][:, self._v_columns], close[1], w["apart"])
-        return np.concatenate(rows), np.concatenate(residuals)
-
-
-class _Apart:
-    """Residuals of parts of a robot that come too close: arms to the rest and to each other, legs to each other.
-
-    The arms' shapes are those of `sim.robots.self_collision`, with the hands' neighbours there counted here; shins and feet,
-    which nothing else needs, are capsules around the description's geoms.
-    """
-
-    def __init__(self, robot: RobotModel) -> None:
-        model, spec = robot.model, robot.spec
-        self._model = model
-        self._shapes = robot.own_body.geometry.clone()
-        sides = [_leg_side(robot, shape.parentJoint) for shape in self._shapes.geometryObjects]
-        known = {robot.model.frames[shape.parentFrame].name for shape in self._shapes.geometryObjects}
-        for shape in default_shapes(spec):
-            solid = solid_on(robot, shape, f"{shape.body}_leg")
-            side = _leg_side(robot, solid.parentJoint)
-            if side and shape.body not in known:
-                self._shapes.addGeometryObject(solid)
-                sides.append(side)
-        parts = robot.own_body.parts
-        for a in range(len(sides)):
-            for b in range(len(sides)):
-                legs = (sides[a], sides[b]) == SIDES
-                hand = a < len(parts) and parts[a] in SIDES and b < len(parts) and parts[b] == "legs"
-                if (legs or hand) and not self._shapes.existCollisionPair(pin.CollisionPair(a, b)):
-                    self._shapes.addCollisionPair(pin.CollisionPair(a, b))
-        self._gaps = self._shapes.createData()
-        pairs = [(pair.first, pair.second) for pair in self._shapes.collisionPairs]
-        #: the very results that a measurement fills in
-        self._results = [self._gaps.distanceResults[index] for index in range(len(pairs))]
-        moved = [moved_by(model, shape.parentJoint) for shape in self._shapes.geometryObjects]
-        self._moves = np.array([moved[a] - moved[b] for a, b in pairs])
-
-    def rows(self, data: pin.Data) -> tuple[Array, Array] | None:
-        """Jacobian (P, nv) and residual (P,) of the pairs nearer than they may be, None without any; m.
-
-        Args:
-            data: of the robot's model, with joint Jacobians in the world frame.
-        """
-        pin.updateGeometryPlacements(self._model, data, self._shapes, self._gaps)
-        if self._results[pin.computeDistances(self._shapes, self._gaps)].min_distance >= _APART_M:
-            return None
-        rows, gaps = close_rows(self._results, data, self._moves, _APART_M)
-        return -rows, np.maximum(gaps - _APART_M, -_DEEPEST_M)
-
-
-def _leg_side(robot: RobotModel, joint: int) -> str:
-    """The side of the leg that a joint is part of, empty for other joints."""
-    above = {robot.model.names[i] for i in robot.model.supports[joint]}
-    legs = robot.spec.leg_joints
-    half = len(legs) // 2
-    return next((side for side, names in zip(SIDES, (legs[:half], legs[half:]), strict=True) if above & set(names)), "")
+        return self._search(q, system, lower, upper, _FIRST_ITERATIONS if first else self.iterations)
 
 
 def _distance(a: Array, b: Array) -> float:
