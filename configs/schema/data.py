@@ -97,7 +97,7 @@ class DataConfig:
     source: Literal["generated", "humanml3d", "amass", "folder"] = "generated"
     path: str | None = None
     body_models: str | None = None
-    clips: int = 360
+    clips: int = 3000
     seed: int = 0
     splits: tuple[str, ...] = ("train", "val", "test")
     mirrored: bool = True
