@@ -323,6 +323,11 @@ class Feedback:
         """Whether every action of the step succeeded."""
         return all(outcome.success for outcome in self.outcomes)
 
+    @property
+    def struck(self) -> bool:
+        """Whether a contingency spoiled an action of the step; unknown, and so False, once the feedback is public."""
+        return any(outcome.contingency for outcome in self.outcomes)
+
     def public(self) -> Feedback:
         """The feedback without what a planner must not know: margins and the draws of the contingency."""
         return replace(self, outcomes=tuple(replace(outcome, margins={}, contingency="") for outcome in self.outcomes))

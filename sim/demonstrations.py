@@ -130,7 +130,7 @@ def run_correction(
     while not session.finished:
         target = expert.next_step()
         step, origin = target, "expert"
-        if rng.random() >= config.noise and len(episode.rows) < task.step_budget - _FINISH:
+        if rng.random() >= config.noise and session.stats.charged < task.step_budget - _FINISH:
             proposed = accepted(student(observation), observation.history[-1] if observation.history else None)
             if proposed is not None:
                 step, origin = proposed, "student"

@@ -99,7 +99,7 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
         goals = self._session.goal_status()
         reward = float(np.mean(goals)) if goals else 0.0
         done = self._session.succeeded or self._session.ended
-        truncated = not done and self._session.stats.steps + self._invalid >= self._session.task.step_budget
+        truncated = not done and self._session.stats.charged + self._invalid >= self._session.task.step_budget
         return self._vector(self._last), reward, done, truncated, self._info(error)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]  # one render mode, one return type

@@ -100,15 +100,22 @@ class SessionStats:
 
     Attributes:
         steps: plan steps taken.
+        struck: those of them that a contingency spoiled.
         path_length_m: length of the base's path.
         makespan_s: simulated seconds.
         arm_steps: arm actions executed, a two-arm action counts twice.
     """
 
     steps: int = 0
+    struck: int = 0
     path_length_m: float = 0.0
     makespan_s: float = 0.0
     arm_steps: int = 0
+
+    @property
+    def charged(self) -> int:
+        """Steps that count towards the budget: it bounds what is planned, not the luck, so struck ones do not."""
+        return self.steps - self.struck
 
     @property
     def arm_utilisation(self) -> float:
@@ -233,6 +240,7 @@ class Session:
         self.stats = dataclasses.replace(
             self.stats,
             steps=self.stats.steps + 1,
+            struck=self.stats.struck + feedback.struck,
             makespan_s=self.stats.makespan_s + feedback.duration_s,
             arm_steps=self.stats.arm_steps + arms,
         )
@@ -300,7 +308,7 @@ class Session:
             self.image_size,
             self.known_objects,
             self._history,
-            self.stats.steps,
+            self.stats.charged,
             self.task.step_budget,
         )
         self._seen.update(seen.visible_objects)
@@ -330,7 +338,7 @@ class Session:
     @property
     def finished(self) -> bool:
         """Whether the episode is over: Done, all goals hold, or the step budget is used up."""
-        return self._ended or self.stats.steps >= self.task.step_budget or self.succeeded
+        return self._ended or self.stats.charged >= self.task.step_budget or self.succeeded
 
     @property
     def history(self) -> tuple[HistoryItem, ...]:

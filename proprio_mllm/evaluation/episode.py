@@ -172,7 +172,7 @@ def episode_steps(
         open_session: makes the session; called inside the guarded part.
         fields: the episode's key.
         instruction: the task's instruction.
-        step_budget: steps allowed.
+        step_budget: steps allowed, without those that a contingency spoils: they are acted out and recorded, not charged.
         luck: the episode's seed (`seeds.episode_seed`), for the session and the planner's random stream.
         watch: sees every observation.
 
@@ -230,8 +230,9 @@ def _loop(
     reply: PlannerReply | None = None
     feedback: Feedback | None = None
     ended = False
-    for number in range(step_budget):
-        shown = _shown(observation, history, number, step_budget)
+    charged = 0
+    while charged < step_budget:
+        shown = _shown(observation, history, charged, step_budget)
         if watch is not None:
             watch(shown, reply, feedback)
         reply = yield Ask(shown, None if feedback is None else feedback.public())
@@ -243,19 +244,21 @@ def _loop(
         tally.planner_s += float(reply.latency_s)
         if reply.step is None:
             feedback = None
+            charged += 1
             tally.invalid += 1
             text = " ".join(reply.text.split())[:80]
             history.append(HistoryItem(text, f"{text} {INVALID_OUTPUT}".strip()))
             tally.trace.append(_invalid(reply))
             continue
         observation, feedback = session.step(reply.step)
+        charged += not feedback.struck
         history.append(HistoryItem(reply.step.to_text(), feedback.to_text()))
         tally.trace.append(_traced(reply.step, feedback))
         ended = any(action.name == "Done" for action in reply.step.actions)
         if ended or all(session.goals().met):
             break
     if watch is not None:
-        watch(_shown(observation, history, len(tally.trace), step_budget), reply, feedback)
+        watch(_shown(observation, history, charged, step_budget), reply, feedback)
     return ended
 
 

@@ -153,8 +153,8 @@ class Reenactment:
 
     def moments(self) -> Iterator[Moment]:
         """The start and every step; the session is closed at the end."""
-        seen, history, budget = self._first, [], self.episode.task.step_budget
-        yield self._moment(0, "", None, (), (), seen, history, budget)
+        seen, history, charged = self._first, [], 0
+        yield self._moment(0, "", None, (), (), seen, history, charged)
         for number, entry in enumerate(self.episode.record.trace, start=1):
             text, outcomes = str(entry["step"]), entry["outcomes"]
             assert isinstance(outcomes, Sequence)
@@ -164,12 +164,14 @@ class Reenactment:
             if expected == (INVALID_OUTPUT,):
                 short = " ".join(text.split())[:80]
                 history.append(HistoryItem(short, f"{short} {INVALID_OUTPUT}".strip()))
+                charged += 1
             else:
                 # Looking around decides what is known, so it is part of acting the episode out.
                 seen, feedback = self.session.step(PlanStep.parse(text))
                 history.append(HistoryItem(text, feedback.to_text()))
+                charged += not feedback.struck
                 codes = tuple(outcome.code for outcome in feedback.outcomes)
-            yield self._moment(number, text, feedback, codes, expected, seen, history, budget)
+            yield self._moment(number, text, feedback, codes, expected, seen, history, charged)
         self.session.close()
 
     def _moment(
@@ -181,9 +183,10 @@ class Reenactment:
         expected: tuple[str, ...],
         seen: Observation,
         history: Sequence[HistoryItem],
-        budget: int,
+        charged: int,
     ) -> Moment:
-        shown = dataclasses.replace(seen, history=tuple(history), step=number, step_budget=budget)
+        budget = self.episode.task.step_budget
+        shown = dataclasses.replace(seen, history=tuple(history), step=charged, step_budget=budget)
         return Moment(number, text, feedback, codes, expected, self.session.goal_status(), shown)
 
 

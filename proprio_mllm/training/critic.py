@@ -244,7 +244,7 @@ def actor_examples(kept: Sequence[Kept], style: Style, last: int) -> list[Exampl
                 moment.visible,
                 moment.known,
                 rollout.history(at),
-                at,
+                moment.number,
                 rollout.step_budget,
                 t.motion[at],
                 style,

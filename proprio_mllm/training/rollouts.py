@@ -84,8 +84,9 @@ class RolloutCollector(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One observation of a rollout and the step that followed; the last moment has an empty step."""
+    """One observation of a rollout, with the steps charged before it, and the step that follows; the last has an empty step."""
 
+    number: int
     step: str
     feedback: str
     ok: bool
@@ -174,7 +175,14 @@ def rollout_row(
     if len(observations) != len(steps) + 1:
         raise ValueError(f"{len(steps)} steps need {len(steps) + 1} observations, got {len(observations)}")
     moments = [
-        {"step": text, "feedback": feedback, "ok": ok, "visible": list(o.visible_objects), "known": list(o.known_objects)}
+        {
+            "number": o.step,
+            "step": text,
+            "feedback": feedback,
+            "ok": ok,
+            "visible": list(o.visible_objects),
+            "known": list(o.known_objects),
+        }
         for o, (text, feedback, ok) in zip(observations, [*steps, ("", "", True)], strict=True)
     ]
     first = observations[0]
@@ -213,7 +221,7 @@ def read_rollouts(folder: Path) -> list[Rollout]:
         if row["split"] != "train":
             raise ValueError(f"{folder}: episode {row['episode']!r} is of split {row['split']!r}; training takes only 'train'")
         moments = tuple(
-            Moment(m["step"], m["feedback"], bool(m["ok"]), tuple(m["visible"]), tuple(m["known"]))
+            Moment(m["number"], m["step"], m["feedback"], bool(m["ok"]), tuple(m["visible"]), tuple(m["known"]))
             for m in json.loads(row["steps"])
         )
         truth = json.loads(row["privileged"] or "{}").get("relations")

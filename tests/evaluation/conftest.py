@@ -24,10 +24,10 @@ from sim.tasks.task import Placement, Start, Task
 
 
 class FakeSession:
-    """Pick works near the mug; the goal is that it is held. `broken` raises at that step."""
+    """Pick works near the mug, but for the first `unlucky` times; the goal is that it is held. `broken` raises at that step."""
 
-    def __init__(self, robot: str = "h1", broken: int | None = None) -> None:
-        self.robot, self.broken = robot, broken
+    def __init__(self, robot: str = "h1", broken: int | None = None, unlucky: int = 0) -> None:
+        self.robot, self.broken, self.unlucky = robot, broken, unlucky
         self.near = self.low = self.held = False
         self.count = 0
 
@@ -59,6 +59,9 @@ class FakeSession:
                 return ActionOutcome(action, False, "TooFar", FailureCategory.NAVIGATION, {"reach_m": 0.4})
             if not self.low:
                 return ActionOutcome(action, False, "BodyTooHigh", FailureCategory.BODY_ADJUSTMENT, {"height_m": -0.2})
+            if self.unlucky:
+                self.unlucky -= 1
+                return ActionOutcome(action, False, "Slipped", FailureCategory.LOGICAL, contingency="slipped")
             self.held = True
         elif action.name == "Place" and not self.held:
             return ActionOutcome(action, False, "HandEmpty", FailureCategory.LOGICAL)

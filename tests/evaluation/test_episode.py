@@ -61,6 +61,18 @@ def test_budget_and_category(session, scripted, fields) -> None:
     assert record.steps == 4
 
 
+def test_steps_that_bad_luck_spoils_are_not_charged(session, scripted, fields) -> None:
+    plan = (*SOLVED[:2], *["Pick(left, Mug_1)"] * 9)
+    planner = scripted(*plan)
+    record = play(session(unlucky=4), planner, fields, budget=3)
+    assert record.outcome is Outcome.SUCCESS
+    assert (record.steps, record.planner_calls) == (7, 7)
+    assert [o.step for o in planner.seen] == [0, 1, 2, 2, 2, 2, 2]
+    assert [step["outcomes"][0]["contingency"] for step in record.trace][2:6] == ["slipped"] * 4
+    assert all(outcome.contingency == "" for heard in planner.heard if heard is not None for outcome in heard.outcomes)
+    assert play(session(unlucky=4), scripted("gibberish", *plan), fields, budget=3).budget_exhausted
+
+
 def test_done_too_early_is_logical_and_not_exhausted(session, scripted, fields) -> None:
     record = play(session(), scripted("GoTo(Mug_1)"), fields)
     assert record.failure is FailureCategory.LOGICAL

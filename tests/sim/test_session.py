@@ -124,6 +124,20 @@ def test_luck_is_keyed_by_the_seed():
     made.close()
 
 
+def test_the_budget_charges_no_step_that_bad_luck_spoils():
+    made = Session("h1", "hard", 0)
+    task = FreePlay("kitchen_1", start=Start(0.85, 1.75, 90.0, {"h1": 0.9}), placements=(), step_budget=2)
+    made.reset(task, 4)
+    struck = []
+    while not made.finished:
+        _, feedback = made.step(PlanStep.parse("ToggleOn(left, StoveKnob_1)"))
+        struck.append(bool(feedback.outcomes[0].contingency))
+        assert made.observation().step == made.stats.charged
+    assert sum(struck) == made.stats.struck > 0
+    assert (made.stats.charged, made.stats.steps) == (2, len(struck))
+    made.close()
+
+
 def test_done_ends_the_episode(session):
     session.reset(TASK, 0)
     feedback = steps(session, "Done()")[0]

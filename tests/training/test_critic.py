@@ -32,8 +32,10 @@ class Scripted(Judge):
 
 
 def trajectory(episode: str, steps: Sequence[tuple[str, bool]], instruction: str, success: bool) -> Trajectory:
-    moments = [Moment(text, f"{text} {'ok' if ok else 'Blocked'}", ok, KNOWN[:2], KNOWN) for text, ok in steps]
-    moments.append(Moment("", "", True, KNOWN[:2], KNOWN))
+    moments = [
+        Moment(i, text, f"{text} {'ok' if ok else 'Blocked'}", ok, KNOWN[:2], KNOWN) for i, (text, ok) in enumerate(steps)
+    ]
+    moments.append(Moment(len(steps), "", "", True, KNOWN[:2], KNOWN))
     count = len(moments)
     from data.shards import encode_png
 
