@@ -86,7 +86,7 @@ def _go(script: Script, wrists: dict[int, Array], seconds: float) -> None:
 
 def _stand(script: Script, seconds: float) -> None:
     script.trunk(0.0, 0.0, seconds, advance=False)
-    script.posture(0.0, 0.03, seconds)
+    script.posture(0.0, 0.0, seconds)
 
 
 def _slow(script: Script, wrists: dict[int, Array]) -> float:
@@ -183,12 +183,13 @@ def gesture(script: Script) -> Phrases:
     for _ in range(int(script.rng.integers(2, 5))):
         seconds = float(script.rng.uniform(0.5, 1.1))
         for side in sides:
-            x, y, z = script.rng.uniform((0.05, -0.05, 0.8), (0.45, 0.5, 1.75))
+            x, y, z = script.rng.uniform((-0.1, -0.1, 0.8), (0.45, 0.62, 1.8))
+            x = max(x, 0.25) if y < 0.45 else x  # not through the trunk, nor close by the shoulder
             script.hand(side, np.array([x, y if side == 0 else -y, z]), seconds, advance=False)
             script.elbow(side, float(script.rng.uniform(-0.1, 0.7)), seconds)
             script.grip(side, float(script.rng.uniform(0.0, 1.0)), seconds)
-        script.trunk(float(script.rng.uniform(-0.25, 0.25)), float(script.rng.uniform(-0.08, 0.08)), seconds, advance=False)
-        script.posture(float(script.rng.uniform(0.0, 0.08)), float(script.rng.uniform(0.0, 0.2)), seconds)
+        script.trunk(float(script.rng.uniform(-0.35, 0.35)), float(script.rng.uniform(-0.15, 0.15)), seconds, advance=False)
+        script.posture(float(script.rng.uniform(0.0, 0.12)), float(script.rng.uniform(-0.05, 0.35)), seconds)
     for side in sides:
         script.hand(side, None, 0.9, advance=False)
         script.elbow(side, 0.0, 0.9)
@@ -282,18 +283,120 @@ def place(script: Script) -> Phrases:
     ]
 
 
+def _held(script: Script, width: float | None = None) -> Array:
+    """Where the left wrist is while both hands hold something; the right one mirrors it."""
+    width = float(script.rng.uniform(0.12, 0.3)) if width is None else width
+    return np.array([script.rng.uniform(0.28, 0.42), width, script.rng.uniform(0.95, 1.35)])
+
+
+def _both(script: Script, left: Array, seconds: float, shift: float = 0.0) -> None:
+    """Moves the left wrist to a point, the right one to its mirror image, both `shift` m to the left; time does not advance."""
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        script.hand(side, left * np.array([1.0, sign, 1.0]) + np.array([0.0, shift, 0.0]), seconds, advance=False)
+
+
 def carry(script: Script) -> Phrases:
     """Carries something in front of the body with both hands."""
     for side in (0, 1):
         script.grip(side, 0.3)
-        wrist = np.array([0.32, 0.16 if side == 0 else -0.16, 1.08])
-        script.hand(side, wrist, 0.8, advance=side == 1)
-    script.walk(float(script.rng.uniform(0.8, 1.8)), pace=0.9)
+    _both(script, _held(script), 0.8)
+    script.posture(float(script.rng.uniform(0.0, 0.06)), float(script.rng.uniform(-0.1, 0.15)), 0.8)
+    way, where = [(0.0, "forward"), (np.pi, "backwards"), (np.pi / 2, "to the left"), (-np.pi / 2, "to the right")][
+        int(script.rng.choice(4, p=(0.64, 0.12, 0.12, 0.12)))
+    ]
+    distance = float(script.rng.uniform(0.8, 1.8)) * (1.0 if way == 0.0 else 0.5)
+    script.walk(distance, direction_rad=way, pace=float(script.rng.uniform(0.8, 1.05)))
     thing = _thing(script, 2)
     return [
-        f"carries {thing} forward with both hands",
-        f"walks ahead while holding {thing} in both hands",
-        f"moves {thing} with both arms",
+        f"carries {thing} {where} with both hands",
+        f"steps {where} while holding {thing} in both hands",
+        f"moves {thing} {where} with both arms",
+    ]
+
+
+def shift(script: Script) -> Phrases:
+    """Moves something that both hands hold from one side of the body to the other."""
+    start = int(script.rng.integers(2))
+    left = _held(script)
+    for side in (0, 1):
+        script.grip(side, 0.3)
+    for sign in (1.0, -1.0) if start == 0 else (-1.0, 1.0):
+        seconds = float(script.rng.uniform(0.8, 1.3))
+        left = left + script.rng.uniform((-0.05, 0.0, -0.25), (0.05, 0.0, 0.2))
+        left[2] = np.clip(left[2], 0.7, 1.5)
+        drop, lean = script.reach_posture([left])
+        _both(script, left, seconds, shift=sign * float(script.rng.uniform(0.1, 0.25)))
+        script.trunk(sign * float(script.rng.uniform(0.3, 0.6)), 0.0, seconds, advance=False)
+        script.posture(drop, lean, seconds)
+        script.wait(float(script.rng.uniform(0.1, 0.4)))
+    for side in (0, 1):
+        script.hand(side, None, 0.9, advance=False)
+    _stand(script, 0.9)
+    name, other, thing = _SIDES[start], _SIDES[1 - start], _thing(script, 2)
+    return [
+        f"moves {thing} from the {name} to the {other} with both hands",
+        f"swings {thing} over from the {name} side to the {other} side with both arms",
+        f"hands {thing} across the body from {name} to {other}",
+    ]
+
+
+def spread(script: Script) -> Phrases:
+    """Spreads one or both arms out to the sides, between hanging and above the shoulders."""
+    sides = [(0,), (1,), (0, 1), (0, 1)][int(script.rng.integers(4))]
+    raised = float(script.rng.uniform(-0.95, 0.85))
+    for _ in range(int(script.rng.integers(1, 3))):
+        seconds = float(script.rng.uniform(0.7, 1.3))
+        for side in sides:
+            angle, ahead = raised + float(script.rng.uniform(-0.12, 0.12)), float(script.rng.uniform(-0.25, 0.45))
+            reach = float(script.rng.uniform(0.4, 0.5))
+            out = 0.18 + reach * np.cos(angle) * np.cos(ahead)
+            wrist = [reach * np.cos(angle) * np.sin(ahead), out if side == 0 else -out, 1.4 + reach * np.sin(angle)]
+            script.hand(side, np.array(wrist), seconds, advance=False)
+            script.grip(side, float(script.rng.uniform(0.3, 1.0)), seconds)
+        bow = float(script.rng.uniform(-0.18, 0.18)) if script.rng.random() < 0.4 else 0.0
+        script.trunk(float(script.rng.uniform(-0.15, 0.15)), bow, seconds)
+        script.wait(float(script.rng.uniform(0.3, 1.2)))
+        raised = float(np.clip(raised + script.rng.uniform(-0.6, 0.6), -0.95, 0.85))
+    for side in sides:
+        script.hand(side, None, 0.9, advance=False)
+    _stand(script, 0.9)
+    if len(sides) == 2:
+        return [
+            "spreads both arms out to the sides",
+            "holds both arms out sideways",
+            "raises the arms on both sides of the body",
+        ]
+    name = _SIDES[sides[0]]
+    return [
+        f"holds the {name} arm out to the side",
+        f"raises the {name} arm sideways",
+        f"spreads the {name} arm away from the body",
+    ]
+
+
+def stretch(script: Script) -> Phrases:
+    """Stretches with both hands above the head, bending to one side or both, or bends back."""
+    ahead = np.array([0.44, 0.24, 1.35])  # hands rise and fall in front, not along the shoulders
+    seconds = float(script.rng.uniform(1.2, 1.6))
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        x, y, z = script.rng.uniform((0.0, 0.05, 1.7), (0.2, 0.35, 1.85))
+        script.hand_path(side, [ahead * [1.0, sign, 1.0], np.array([x, sign * y, z])], seconds)
+    script.posture(0.0, float(script.rng.uniform(-0.2, 0.05)), seconds)
+    first = float(script.rng.choice((-1.0, 1.0)))
+    for sign in (first, -first) if script.rng.random() < 0.5 else (first,):
+        script.trunk(0.0, sign * float(script.rng.uniform(0.1, 0.3)), float(script.rng.uniform(0.6, 1.0)))
+        script.wait(float(script.rng.uniform(0.1, 0.5)))
+    script.trunk(0.0, 0.0, 0.8, advance=False)
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        script.hand_path(side, [ahead * [1.0, sign, 1.0]], 0.8)
+    script.wait(0.8)
+    for side in (0, 1):
+        script.hand(side, None, 0.8, advance=False)
+    _stand(script, 0.8)
+    return [
+        "stretches both arms above the head",
+        "reaches up high with both hands and bends sideways",
+        "stretches the upper body",
     ]
 
 
@@ -310,7 +413,8 @@ def lift(script: Script) -> Phrases:
         script.grip(side, 0.3)
     script.wait(0.35)
     for side in (0, 1):
-        script.hand(side, np.array([0.33, left[1] if side == 0 else -left[1], 1.12]), seconds, advance=False)
+        script.grip(side, 0.3)
+    _both(script, _held(script, float(left[1])), seconds)
     _stand(script, seconds)
     thing = _thing(script, 2)
     return [
@@ -381,7 +485,7 @@ def open_door(script: Script) -> Phrases:
     _go(script, {side: arc[0]}, float(script.rng.uniform(0.8, 1.1)))
     script.grip(side, 0.1)
     script.wait(0.3)
-    _sweep(script, side, arc, float(script.rng.uniform(1.1, 1.6)))
+    _sweep(script, side, arc[1:], float(script.rng.uniform(1.1, 1.6)))
     script.grip(side, 0.7)
     script.wait(0.2)
     script.hand(side, None, 0.9, advance=False)
@@ -396,7 +500,7 @@ def close_door(script: Script) -> Phrases:
     height, arc = _door_arc(script, side, 0.8, 0.05)
     script.grip(side, 0.5)
     _go(script, {side: arc[0]}, float(script.rng.uniform(0.8, 1.1)))
-    _sweep(script, side, arc, float(script.rng.uniform(0.9, 1.4)))
+    _sweep(script, side, arc[1:], float(script.rng.uniform(0.9, 1.4)))
     script.wait(0.2)
     script.hand(side, None, 0.9, advance=False)
     _stand(script, 0.9)
@@ -458,7 +562,8 @@ def put_down(script: Script) -> Phrases:
     width = float(script.rng.uniform(0.12, 0.24))
     for side in (0, 1):
         script.grip(side, 0.3)
-        script.hand(side, np.array([0.32, width if side == 0 else -width, 1.1]), 0.8, advance=side == 1)
+    _both(script, _held(script, width), 0.8)
+    script.wait(0.8)
     height = _choice(script, list(HEIGHTS)[:3])
     left = _point(script, 0, height, width)
     wrists = {0: left, 1: left * np.array([1.0, -1.0, 1.0])}
@@ -517,6 +622,9 @@ ACTIVITIES: Final[Mapping[str, Activity]] = {
     "put_down": put_down,
     "look_around": look_around,
     "gesture": gesture,
+    "shift": shift,
+    "spread": spread,
+    "stretch": stretch,
 }
 #: Sequences that make sense together, besides each activity alone.
 RECIPES: Final[tuple[tuple[str, ...], ...]] = (
@@ -550,6 +658,16 @@ RECIPES: Final[tuple[tuple[str, ...], ...]] = (
     ("gesture", "walk"),
     ("walk", "gesture"),
     ("gesture", "reach"),
+    ("lift", "shift"),
+    ("carry", "shift"),
+    ("lift", "carry"),
+    ("spread", "walk"),
+    ("walk", "spread"),
+    ("spread", "gesture"),
+    ("side_step", "spread"),
+    ("stretch", "turn"),
+    ("walk", "stretch"),
+    ("turn", "gesture"),
     ("walk", "pick", "turn"),
     ("turn", "walk", "place"),
 )

@@ -38,6 +38,8 @@ _TOE_M: Final = 0.02
 _LOW_TOE_M: Final = 0.08
 _HIGH_TOE_M: Final = 0.30
 _UPRIGHT: Final = 0.65
+#: Cosine of the greatest angle of the trunk from upright.
+_TRUNK_UP: Final = 0.26
 _LEAST_S: Final = 1.0
 
 
@@ -105,9 +107,9 @@ def on_floor(joints: Array) -> Array:
 def level_parts(motion: HumanMotion) -> list[HumanMotion]:
     """The parts of a long capture in which the person is on the floor and upright, in order, without captions.
 
-    Both feet are near the floor (the lower toe under 8 cm, the higher under 30 cm), and the pelvis is above 0.65 of its median
-    height over the frames with such feet, for at least 1 s. What lies between is climbing, kneeling or lying, which no floor
-    at 0 explains.
+    Both feet are near the floor (the lower toe under 8 cm, the higher under 30 cm), the pelvis is above 0.65 of its median
+    height over the frames with such feet, and the trunk is within 75 degrees of upright, for at least 1 s. What lies between is
+    climbing, which no floor at 0 explains, kneeling, crawling or lying.
 
     Returns:
         Clips called `NAME[START:END]`, frames of the capture.
@@ -117,7 +119,9 @@ def level_parts(motion: HumanMotion) -> list[HumanMotion]:
     near = (toes.min(axis=1) < _LOW_TOE_M) & (toes.max(axis=1) < _HIGH_TOE_M)
     if not near.any():
         return []
-    level = near & (pelvis > _UPRIGHT * np.median(pelvis[near]))
+    trunk = motion.joints[:, index("neck")] - motion.joints[:, 0]
+    upright = trunk[:, 2] > _TRUNK_UP * np.linalg.norm(trunk, axis=1)
+    level = near & upright & (pelvis > _UPRIGHT * np.median(pelvis[near]))
     runs = [(start, end) for start, end in contact_runs(level) if end - start >= _LEAST_S * motion.fps]
     return [
         HumanMotion(

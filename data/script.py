@@ -3,7 +3,8 @@
 Values move along minimum-jerk curves. Steps are planned first and stance feet do not move, so that contacts are real: the body
 follows its path, each foot swings to where the body will be and stays there until its next step. While one foot swings the
 weight is over the other, the pelvis rises and falls with the steps and the chest turns against the legs. Nobody stands quite
-still: trunk, pelvis and hands drift slowly by small amounts.
+still: trunk, pelvis and hands drift slowly by small amounts. And everyone has habits: how wide, how far out and how staggered
+the feet stand, how the trunk and the arms hang, how long the steps are.
 Axes: x forward, y left, z up. Sides: 0 left, 1 right.
 
 Paper: none; part of the generator of motions.
@@ -18,15 +19,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.posing import ANKLE_HEIGHT_M, ARM_LENGTH_M, FOOT_SPREAD_M, STANDING_HEIGHT_M, Channels, pose
+from data.posing import ANKLE_HEIGHT_M, ARM_LENGTH_M, FOOT_SPREAD_M, SHOULDER_HEIGHT_M, STANDING_HEIGHT_M, Channels, pose
 
-__all__ = ["HANG", "Script", "minimum_jerk"]
+__all__ = ["Script", "minimum_jerk"]
 
 Array = NDArray[np.float64]
-#: Left wrist hanging at the side, in the base frame.
-HANG: Final = np.array([0.04, 0.235, 0.91])
-_MIRROR: Final = np.array([1.0, -1.0, 1.0])
-_TOE_OUT_RAD: Final = 0.12
 _SWING_HEIGHT_M: Final = 0.075
 #: Greatest slow drift of pelvis and hands (m) and of the trunk's angles (rad), and its frequencies (Hz).
 _DRIFT_M: Final = 0.012
@@ -80,6 +77,56 @@ class _Walk:
     first_foot: int
 
 
+class _Habits:
+    """How one person stands, hangs the arms and steps.
+
+    Attributes:
+        spread_m: from the middle of the body to each foot.
+        stagger_m: how far the left foot is ahead of the middle, and the right one behind it.
+        toe_out_rad: of each foot.
+        lean_rad, side_rad, twist_rad: of the trunk.
+        stride: length of steps as a share of the usual one.
+        hang: (2, 3) wrists hanging at the sides, in the base frame.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.spread_m = float(rng.triangular(0.085, FOOT_SPREAD_M, 0.2))
+        self.stagger_m = float(np.clip(rng.normal(0.0, 0.04), -0.1, 0.1))
+        self.toe_out_rad = float(rng.uniform(-0.03, 0.3))
+        self.lean_rad = float(np.clip(rng.normal(0.03, 0.07), -0.1, 0.2))
+        self.side_rad = float(np.clip(rng.normal(0.0, 0.03), -0.08, 0.08))
+        self.twist_rad = float(np.clip(rng.normal(0.0, 0.06), -0.15, 0.15))
+        self.stride = float(rng.uniform(0.75, 1.2))
+        self.hang = np.stack([_hanging(rng, sign) for sign in (1.0, -1.0)])
+
+    def foot(self, place: Array, side: int) -> Array:
+        """Ankle x, y, z (m) and foot yaw (rad) of a body at x, y, yaw."""
+        sign = 1.0 if side == 0 else -1.0
+        x, y, yaw = place
+        out, ahead = sign * self.spread_m, sign * self.stagger_m - 0.03
+        return np.array(
+            [
+                x - out * np.sin(yaw) + ahead * np.cos(yaw),
+                y + out * np.cos(yaw) + ahead * np.sin(yaw),
+                ANKLE_HEIGHT_M,
+                yaw + sign * self.toe_out_rad,
+            ]
+        )
+
+
+def _hanging(rng: np.random.Generator, sign: float) -> Array:
+    """A wrist of an almost straight arm that hangs a little forward and more or less out; `sign` is 1 for the left one."""
+    out, ahead = min(abs(float(rng.normal(0.0, 0.18))), 0.6), float(np.clip(rng.normal(0.07, 0.09), -0.15, 0.35))
+    arm = (0.94 - 0.06 * rng.random()) * ARM_LENGTH_M
+    return np.array(
+        [
+            arm * np.sin(ahead),
+            sign * (_SHOULDERS_M[0] + 0.055 + arm * np.sin(out) * np.cos(ahead)),
+            SHOULDER_HEIGHT_M - arm * np.cos(out) * np.cos(ahead),
+        ]
+    )
+
+
 class Script:
     """Collects what happens.
 
@@ -101,7 +148,8 @@ class Script:
         self._elbows = elbows
         self._swivel = [Track(elbows[:1].copy()), Track(elbows[1:].copy())]
         self._drift = _Drift(rng)
-        self._hands = [Track(HANG.copy()), Track(HANG * _MIRROR)]
+        self._habits = _Habits(rng)
+        self._hands = [Track(wrist.copy()) for wrist in self._habits.hang]
         self._free = [Track(np.ones(1)), Track(np.ones(1))]
         self._opening = [Track(np.array([0.6])), Track(np.array([0.6]))]
         self._walks: list[_Walk] = []
@@ -112,7 +160,9 @@ class Script:
 
     def walk(self, distance_m: float, direction_rad: float = 0.0, turn_rad: float = 0.0, pace: float = 1.0) -> None:
         """Steps along a direction relative to the heading (0 ahead), turning on the way; `pace` stretches or shortens steps."""
-        stride = 0.37 if abs(np.cos(direction_rad)) > 0.7 else 0.25
+        stride = 0.37 * self._habits.stride
+        if abs(np.cos(direction_rad)) <= 0.7:  # sideways one foot must not step over the other
+            stride = min(0.68 * stride, max(2.0 * self._habits.spread_m - 0.1, 0.1))
         steps = max(2, int(np.ceil(max(distance_m / stride, abs(turn_rad) / 0.55))))
         first = int(self.rng.integers(2))
         if abs(turn_rad) > 0.2:
@@ -146,14 +196,16 @@ class Script:
     def hand(self, side: int, wrist: Array | None, seconds: float, advance: bool = True) -> None:
         """Moves one wrist to a point of the base frame, or lets it hang (None)."""
         end = self.time_s + seconds
-        target = (HANG if side == 0 else HANG * _MIRROR) if wrist is None else wrist
+        target = self._habits.hang[side] if wrist is None else wrist
         self._hands[side].move(self.time_s, end, target)
         self._free[side].move(self.time_s, end, np.array([float(wrist is None)]))
         if advance:
             self.time_s = end
 
     def hand_path(self, side: int, wrists: list[Array], seconds: float) -> None:
-        """Moves one wrist through points of the base frame in one minimum-jerk sweep; time does not advance."""
+        """Moves one wrist on through points of the base frame in one minimum-jerk sweep; time does not advance."""
+        self._free[side].move(self.time_s, self.time_s + seconds, np.zeros(1))
+        wrists = [self._hands[side].value, *wrists]
         share = np.linspace(0.0, 1.0, 13)
         places = minimum_jerk(share) * (len(wrists) - 1)
         points = np.stack([np.interp(places, np.arange(len(wrists)), np.array(wrists)[:, axis]) for axis in range(3)], axis=1)
@@ -188,9 +240,10 @@ class Script:
         times = np.arange(int(np.ceil(self.time_s * fps)) + 1) / fps
         base, feet, swing, weight, bob = self._locomotion(times)
         drift = self._drift.sample(times)
-        lean = self._lean.sample(times)[:, 0] + _DRIFT_RAD * drift[:, 0]
-        side_lean = self._side.sample(times)[:, 0] + _DRIFT_RAD * drift[:, 1]
-        twist = self._twist.sample(times)[:, 0] + 2.0 * _DRIFT_RAD * drift[:, 2]
+        habits = self._habits
+        lean = self._lean.sample(times)[:, 0] + habits.lean_rad + _DRIFT_RAD * drift[:, 0]
+        side_lean = self._side.sample(times)[:, 0] + habits.side_rad + _DRIFT_RAD * drift[:, 1]
+        twist = self._twist.sample(times)[:, 0] + habits.twist_rad + 2.0 * _DRIFT_RAD * drift[:, 2]
         twist += _COUNTER_RAD_M * 0.5 * (swing[:, 1] - swing[:, 0])
         sway = np.column_stack([np.zeros_like(weight), weight]) + _DRIFT_M * drift[:, 3:5]
         height = self._height.sample(times)[:, 0] + bob
@@ -221,7 +274,7 @@ class Script:
         swing = np.zeros((len(times), 2))
         weight, bob = np.zeros(len(times)), np.zeros(len(times))
         place = np.zeros(3)
-        feet = [Track(_foot(place, side)) for side in (0, 1)]
+        feet = [Track(self._habits.foot(place, side)) for side in (0, 1)]
         lift = np.zeros((len(times), 2))
         for walk in self._walks:
             duration = walk.step_s * walk.steps
@@ -230,7 +283,7 @@ class Script:
                 side = (walk.first_foot + step) % 2
                 begin = walk.start_s + step * walk.step_s
                 landing = path(min((step + 1.5) * walk.step_s / duration, 1.0))
-                feet[side].move(begin + 0.08 * walk.step_s, begin + 0.86 * walk.step_s, _foot(landing, side))
+                feet[side].move(begin + 0.08 * walk.step_s, begin + 0.86 * walk.step_s, self._habits.foot(landing, side))
                 u = np.clip((times - begin - 0.08 * walk.step_s) / (0.78 * walk.step_s), 0.0, 1.0)
                 lift[:, side] += _SWING_HEIGHT_M * np.sin(np.pi * u) ** 2
                 phase_of = np.clip((times - begin) / walk.step_s, 0.0, 1.0)
@@ -262,19 +315,6 @@ class _Drift:
         """(T, channels) values."""
         angles = 2.0 * np.pi * times[:, None, None] * self._frequency + self._phase
         return np.sin(angles).mean(axis=1)
-
-
-def _foot(place: Array, side: int) -> Array:
-    sign = 1.0 if side == 0 else -1.0
-    x, y, yaw = place
-    return np.array(
-        [
-            x - sign * FOOT_SPREAD_M * np.sin(yaw) - 0.03 * np.cos(yaw),
-            y + sign * FOOT_SPREAD_M * np.cos(yaw) - 0.03 * np.sin(yaw),
-            ANKLE_HEIGHT_M,
-            yaw + sign * _TOE_OUT_RAD,
-        ]
-    )
 
 
 def _path(walk: _Walk, start: Array) -> Callable[[float], Array]:

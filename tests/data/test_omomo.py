@@ -7,7 +7,7 @@ import pytest
 
 from data.generator import generate_clip
 from data.omomo import find_demo_clips, level_parts, load_mocap
-from data.skeleton import HumanMotion
+from data.skeleton import HumanMotion, index
 
 UP = np.array([0.0, 0.0, 0.5])
 
@@ -39,6 +39,15 @@ def test_a_lifted_foot_ends_a_part() -> None:
     motion.joints[15:, 10] += [0.0, 0.0, 0.4]
     assert level_parts(motion) == []
     assert level_parts(dataclasses.replace(motion, joints=motion.joints + 2.0 * UP)) == []
+
+
+def test_crawling_ends_a_part() -> None:
+    motion = dataclasses.replace(capture(), joints=capture().joints[:40].copy(), hand_opening=None)
+    joints = motion.joints[25:]
+    trunk = [index(name) for name in ("spine1", "spine2", "spine3", "neck", "head")]
+    up = joints[:, trunk] - joints[:, :1]
+    joints[:, trunk] = joints[:, :1] + np.stack([up[..., 2], up[..., 1], 0.1 * up[..., 2]], axis=-1)
+    assert [part.name for part in level_parts(motion)] == ["climb[0:25]"]
 
 
 @pytest.mark.motions
