@@ -65,11 +65,17 @@ class MotionWindows:
         return np.stack(out)
 
     def statistics(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Mean and deviation (F,) of all training frames, clips and windows weighted alike; deviations over `FEATURE_BIAS`."""
+        """Mean and scale (F,) of all training frames, clips and windows weighted alike.
+
+        The scale is the deviation over `FEATURE_BIAS`, for the coordinates of the key bodies their common one: a millimetre
+        counts the same everywhere, and a coordinate that hardly moves here does not drown the others in clips where it does.
+        """
         clips = np.concatenate([self.clips.motions[int(i)] for i in self.clips.split.train])
         parts = [clips] if len(self.train) == 0 else [clips, self.train.reshape(-1, clips.shape[1])]
         mean = np.mean([part.mean(axis=0) for part in parts], axis=0)
         square = np.mean([((part - mean) ** 2).mean(axis=0) for part in parts], axis=0)
+        bodies = slice(0, 3 * KEY_BODY_COUNT)
+        square[bodies] = square[bodies].mean()
         return mean.astype(np.float32), (np.sqrt(square) / FEATURE_BIAS).astype(np.float32)
 
 

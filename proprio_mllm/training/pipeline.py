@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 Metrics = dict[str, float]
 
 #: Raised when what a stage trains on changes in code, so that older output is not taken for current.
-RECIPES: Final[Mapping[str, int]] = {"base": 3, "alignment": 5, "selu": 4}
+RECIPES: Final[Mapping[str, int]] = {"base": 3, "tokenizer": 1, "alignment": 5, "selu": 4}
 #: Stages whose current output a stage starts from.
 NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
     "corrections": ("base",),
@@ -120,7 +120,7 @@ class Pipeline:
             inputs = {kind: shard_hash(shards(kind)) for kind in ("clips", "views", "demos")}
             wanted = {
                 "loop": _loop_values(cfg.tokenizer), "motion": dataclasses.asdict(cfg.model.motion),
-                "bias": FEATURE_BIAS.tolist(),
+                "bias": FEATURE_BIAS.tolist(), "recipe": RECIPES["tokenizer"],
             }  # fmt: skip
             return stage_key(wanted, cfg.seed, inputs)
         model = dataclasses.asdict(variant_model(cfg.model, cfg.variant))
