@@ -7,6 +7,7 @@ types, families of single-arm tasks, categories). Every figure says below itself
 from __future__ import annotations
 
 import hashlib
+import math
 import textwrap
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -156,22 +157,24 @@ def task_distribution(tasks: Sequence[Task], path: Path) -> Path:
     placed = [_types(placement.object_id for placement in task.placements) for task in tasks]
     scenes = Counter(kind for named, own in zip(goals, placed, strict=True) for kind in named | own)
     wanted = Counter(kind for named in goals for kind in named)
-    families = Counter(task.family for task in tasks if task.category == "single")
+    single = Counter(task.family for task in tasks if task.category == "single")
+    pairs = Counter(task.family for task in tasks if task.category != "single")
     small = {
         "categories": Counter(task.category for task in tasks),
-        "families, dual-arm tasks": Counter(task.family for task in tasks if task.category != "single"),
+        f"families, {sum(single.values())} single-arm tasks": single,
         "rooms": Counter(task.room for task in tasks),
     }
     types = _ranked(scenes)
-    columns = [types[start : start + _COLUMN] for start in range(0, len(types), _COLUMN)] or [[]]
-    lines = max(*(len(column) for column in columns), len(families), sum(len(counts) + 3 for counts in small.values()))
+    each = max(math.ceil(len(types) / max(1, math.ceil(len(types) / _COLUMN))), 1)
+    columns = [types[start : start + each] for start in range(0, len(types), each)] or [[]]
+    lines = max(*(len(column) for column in columns), len(pairs), sum(len(counts) + 3 for counts in small.values()))
     figure, panels = _figure(4.2 * (len(columns) + 2), 1.2 + _LINE_INCH * lines, len(columns) + 2)
     for number, column in enumerate(columns):
         title = "object types: tasks with one in a goal (dark), in the scene" if number == 0 else ""
         _bars(panels[number], column, scenes, title, wanted)
         panels[number].set_xlim(0, 1.15 * max(scenes.values(), default=1))
-    _bars(panels[-2], _ranked(families), families, f"families, {sum(families.values())} single-arm tasks")
-    for axes, column in zip(panels[:-1], [*columns, list(families)], strict=True):  # lists of any length, lines as high
+    _bars(panels[-2], _ranked(pairs), pairs, f"families, {sum(pairs.values())} dual-arm tasks")
+    for axes, column in zip(panels[:-1], [*columns, list(pairs)], strict=True):  # lists of any length, lines as high
         axes.set_ylim(len(column) - 0.3 - lines, len(column) - 0.3)
     _stacked(panels[-1], small)
     digest = hashlib.sha256(tasks_text(list(tasks)).encode()).hexdigest()[:12]
