@@ -76,6 +76,7 @@ def episode_digest(record: EpisodeRecord, task: Task | None, acted: ActedOut | N
         "family": "" if task is None else task.family,
         "room": "" if task is None else task.room,
         "step_budget": None if task is None else task.step_budget,
+        "struck": sum(any(outcome["contingency"] for outcome in step["outcomes"]) for step in trace),
         "why": _why(record, trace, goals, task),
         "goals": goals,
         "trace": trace,

@@ -147,7 +147,8 @@
   // ---- the opened episode
 
   const costs = (e) => [
-    ["steps", e.step_budget === null ? e.steps : `${e.steps} of ${e.step_budget}`],
+    ["steps", e.step_budget === null ? e.steps : `${e.steps - e.struck} of ${e.step_budget}`],
+    ...(e.struck ? [["struck by bad luck, not charged", e.struck]] : []),
     ["goals met", `${Math.round(100 * e.goal_conditions_met)} %`],
     ["makespan", `${fixed(e.makespan_s, 1)} s`],
     ["path", `${fixed(e.path_length_m, 2)} m`],
