@@ -62,7 +62,7 @@ from sim.robots.spec import SIDES, load_robot
 SCRIPTS: Final = Path(__file__).parent / "retargeters"
 OURS, MINK, HOLOSOMA = "ours", "mink (GMR)", "holosoma"
 #: A walk, a reach to the floor with both hands, a wave, a turn with a push.
-GENERATED: Final = (0, 8, 16, 40)
+GENERATED: Final = (0, 8, 16, 43)
 HEIGHTS_M: Final = {"h1": 1.80, "x1": 1.27}
 #: Height of a person over leg and back up to the head joint: 1.203 and 1.207 for the OMOMO subjects, whose heights are known.
 STATURE: Final = 1.205

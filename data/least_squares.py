@@ -67,7 +67,6 @@ class BoundedSearch:
         best, damping, cost = q, self._damping, np.inf
         hessian = gradient = np.empty(0)
         width = len(self._v)
-        diagonal = slice(0, None, width + 1)
         for left in range(iterations - 1, -1, -1):
             jacobian, residual = system(q)
             away = self._prior * (q[self._q] - self._rest)
@@ -85,9 +84,9 @@ class BoundedSearch:
                 hessian = jacobian.T @ jacobian
                 gradient = jacobian.T @ residual
                 gradient[6:] += self._prior * away
-                hessian.flat[diagonal] += self._prior_curvature
+                hessian.reshape(-1)[:: width + 1] += self._prior_curvature
             damped = hessian.copy()
-            damped.flat[diagonal] += damping
+            damped.reshape(-1)[:: width + 1] += damping
             here = best[self._q]
             step = np.zeros(self._model.nv)
             step[self._v] = bounded_step(damped, gradient, lower - here, upper - here)
@@ -111,7 +110,7 @@ def bounded_step(hessian: Array, gradient: Array, lower: Array, upper: Array) ->
         right = np.where(held, step, -gradient - hessian @ fixed)
         rest = hessian.copy()
         rest[held] = rest[:, held] = 0.0
-        rest.flat[:: len(step) + 1] += held  # those rows say that held joints keep their value
+        rest.reshape(-1)[:: len(step) + 1] += held  # those rows say that held joints keep their value
         step = _solve(rest, right)
     step[6:] = np.minimum(np.maximum(step[6:], lower), upper)
     return step

@@ -88,7 +88,7 @@ class Residuals:
         self._turned = moved[:3, None] * np.array([_PELVIS_ROTATION, _SOLE_ROTATION, _SOLE_ROTATION])[:, None, None]
         self._turn_weights = np.array([_PELVIS_ROTATION, _SOLE_ROTATION, _SOLE_ROTATION])[:, None]
         self._combination = _combination()
-        self._corner_offsets = [frames.sole_level[foot].T @ frames.corners.T for foot in (0, 1)]  # (3, 4) in the sole's frame
+        self._corner_offsets = frames.sole_level.swapaxes(1, 2) @ frames.corners.T  # (2, 3, 4) in the soles' frames
         self._apart = _Apart(robot, data)
 
     def follow(self, targets: Targets) -> list[System]:
@@ -130,14 +130,14 @@ class Residuals:
             (self._combination @ places - aim).ravel(),
             (np.array([pin.log3(off[0]), pin.log3(off[1]), pin.log3(off[2])]) * self._turn_weights).ravel(),
         ]
-        for foot in (1, 2):
-            heights = turns[foot, 2] @ self._corner_offsets[foot - 1] + places[foot, 2]
-            if heights.min() < 0.0:
-                below = np.flatnonzero(heights < 0.0)
-                x, y = (turns[foot, :2] @ self._corner_offsets[foot - 1])[:, below, None]
-                jacobian = jacobians[foot, 2] + self._moved[foot] * (angular[0] * y - angular[1] * x)
-                rows.append(jacobian * _FLOOR)
-                residuals.append(heights[below] * _FLOOR)
+        corners = turns[1:] @ self._corner_offsets  # (2, 3, 4)
+        heights = corners[:, 2] + places[1:3, 2:]
+        if heights.min() < 0.0:
+            foot, corner = np.nonzero(heights < 0.0)
+            x, y = corners[foot, 0, corner, None], corners[foot, 1, corner, None]
+            jacobian = jacobians[1 + foot, 2] + self._moved[1 + foot, 0] * (angular[0] * y - angular[1] * x)
+            rows.append(jacobian * _FLOOR)
+            residuals.append(heights[foot, corner] * _FLOOR)
         close = self._apart.rows()
         if close is not None:
             rows.append(close[0][:, self._columns] * _APART)

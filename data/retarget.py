@@ -33,7 +33,7 @@ from data.skeleton import HumanMotion
 from data.targets import Measures, Targets, make_targets
 from sim.robots.kinematics import RobotModel
 from sim.robots.leg_ik import crouch
-from sim.robots.spec import RobotSpec
+from sim.robots.spec import KEY_BODIES, RobotSpec
 
 __all__ = ["MAX_JOINT_VELOCITY", "Measured", "Retargeted", "Retargeter"]
 
@@ -122,6 +122,8 @@ class Retargeter:
         frames = BodyFrames(
             self._pelvis, (self._soles[0], self._soles[1]), (left, right), self.measures.sole_level, self._corners
         )
+        #: views into Pinocchio's data
+        self._keys = [self.robot.data.oMf[frame(keys[name])].translation for name in KEY_BODIES]
         self._residuals = Residuals(self.robot, frames, self._v_columns)
         self._search = BoundedSearch(
             model, self._q_columns, self._v_columns, self._prior, self._reference[self._q_columns], _DAMPING
@@ -174,7 +176,8 @@ class Retargeter:
             q = self._solve(q, system, t == 0)
             root[t] = q[[0, 1, 2, 6, 3, 4, 5]]
             joints[t] = self._with_hands(q, opening[t])
-            keys[t] = self.robot.key_body_positions(root[t], joints[t])
+            pin.framesForwardKinematics(self.robot.model, self.robot.data, q)
+            keys[t] = self._keys
         features = encode_frames(root, keys, opening, FPS)
         captions = tuple(caption.text for caption in human.captions if caption.end_s == 0.0)
         captions = captions or tuple(caption.text for caption in human.captions)

@@ -191,15 +191,13 @@ def close_rows(results: Sequence[Any], data: pin.Data, moves: Array, near_m: flo
         moves: (all pairs, N) 1 where a joint moves a pair's first shape only, -1 where the second only.
         near_m: distance from which on a pair is left out.
     """
-    close, lines, gaps = [], [], []
-    for index, result in enumerate(results):  # numbers one by one: arrays of three cost more than what they save
-        distance = result.min_distance
-        if distance < near_m:
-            (x, y, z), (u, v, w) = result.getNearestPoint1().tolist(), result.normal.tolist()
-            close.append(index)
-            lines.append((u, v, w, y * w - z * v, z * u - x * w, x * v - y * u))
-            gaps.append(distance)
-    return (np.array(lines) @ data.J) * moves[close], np.array(gaps)
+    gaps = np.array([result.min_distance for result in results])
+    close = np.flatnonzero(gaps < near_m)
+    lines = []
+    for index in close.tolist():  # numbers one by one: arrays of three cost more than what they save
+        (x, y, z), (u, v, w) = results[index].getNearestPoint1().tolist(), results[index].normal.tolist()
+        lines.append((u, v, w, y * w - z * v, z * u - x * w, x * v - y * u))
+    return (np.array(lines) @ data.J) * moves[close], gaps[close]
 
 
 def solid_on(robot: RobotModel, shape: BodyShape, name: str) -> pin.GeometryObject:
