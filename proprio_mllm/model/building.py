@@ -18,7 +18,9 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -156,7 +158,8 @@ def add_adapter(model: ProprioMLLM, name: str = "default", start: str | None = N
         model.vlm.add_adapter(name, lora)
     else:
         heads = {k: p.requires_grad for k, p in model.named_parameters() if not k.startswith("vlm.")}
-        model.vlm = get_peft_model(model.core, lora, adapter_name=name)  # type: ignore[arg-type]  # peft's stub wants PreTrainedModel
+        with _names_of_old():
+            model.vlm = get_peft_model(model.core, lora, adapter_name=name)  # type: ignore[arg-type]  # peft's stub wants PreTrainedModel
         for key, parameter in model.named_parameters():
             if key in heads:
                 parameter.requires_grad_(heads[key])
@@ -167,6 +170,14 @@ def add_adapter(model: ProprioMLLM, name: str = "default", start: str | None = N
             for key, parameter in parameters.items():
                 if adapter_of(key) == name:
                     parameter.copy_(parameters[f".{start}".join(key.rsplit(f".{name}", 1))])
+
+
+@contextmanager
+def _names_of_old() -> Iterator[None]:
+    """PEFT asks Transformers by a name that has a newer one, which is nothing that a user could mend."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="`is_gradient_checkpointing` is deprecated", category=FutureWarning)
+        yield
 
 
 def merge_adapter(model: ProprioMLLM) -> None:
@@ -282,7 +293,8 @@ def load_model(folder: str | Path, adapter: str | None = None, trainable: bool =
         if isinstance(model.vlm, PeftModel):
             model.vlm.load_adapter(path, name, is_trainable=trainable)
         else:
-            model.vlm = PeftModel.from_pretrained(model.core, path, adapter_name=name, is_trainable=trainable)
+            with _names_of_old():
+                model.vlm = PeftModel.from_pretrained(model.core, path, adapter_name=name, is_trainable=trainable)
     if adapter is not None or names:
         use_adapter(model, adapter if adapter is not None else names[0])
         if not trainable:
