@@ -15,6 +15,7 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 from rich.console import Console
 
 from configs.compose import compose
+from configs.help import asks_for_help, help_text
 from configs.schema.eval import EvalConfig
 from configs.validate import ConfigError, build
 
@@ -31,6 +32,9 @@ def main(overrides: Sequence[str]) -> int:
         0; 1 when episodes stay without a score, weights are absent or a table cannot be assembled; 2 on a wrong key, value or
         ledger.
     """
+    if asks_for_help(overrides):
+        sys.stdout.write(help_text("eval", EvalConfig, __doc__ or ""))
+        return 0
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     console = Console(stderr=True, highlight=False)
     try:

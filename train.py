@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 from configs.compose import compose
+from configs.help import asks_for_help, help_text
 from configs.schema.train import TrainConfig
 from configs.validate import ConfigError, build
 
@@ -117,6 +118,9 @@ def _corrections(*args: Any, **kwargs: Any) -> Any:
 
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 1 when an input is missing, 2 on a configuration that is not allowed."""
+    if asks_for_help(arguments):
+        sys.stdout.write(help_text("train", TrainConfig, __doc__ or ""))
+        return 0
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     for noisy in ("httpx", "datasets", "filelock", "OpenGL"):
         logging.getLogger(noisy).setLevel(logging.WARNING)

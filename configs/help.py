@@ -1,0 +1,98 @@
+"""`--help` of the entry points: the groups with their values, and every field with what it means and what it is by default.
+
+Meanings come from the `Attributes:` sections of the schemas' docstrings, so that there is one text for both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import textwrap
+import typing
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+import yaml
+
+from configs.compose import CONFIG_DIR, compose, groups
+
+__all__ = ["asks_for_help", "help_text"]
+
+_WIDTH: Final = 110
+_ENTRY: Final = re.compile(r"^(\w+(?:, \w+)*): (.*)$")
+
+
+def asks_for_help(arguments: typing.Sequence[str]) -> bool:
+    """Whether `-h` or `--help` is among the arguments."""
+    return any(argument in ("-h", "--help") for argument in arguments)
+
+
+def help_text(root: str, schema: type, about: str) -> str:
+    """What a command takes.
+
+    Args:
+        root: name of its root file, `train` or `eval`.
+        schema: its frozen configuration.
+        about: the command's own description.
+    """
+    values = compose(root)
+    lines = [*textwrap.dedent(about).strip().splitlines(), "", "Groups (`group=value`):", ""]
+    defaults = yaml.safe_load((CONFIG_DIR / f"{root}.yaml").read_text(encoding="utf-8"))["defaults"]
+    for name in (name for entry in defaults if isinstance(entry, dict) for name in entry):
+        lines += _entry(name, ", ".join(groups()[name]), 2, 16)
+    lines += ["", "Fields (`field=value`; of a group `group.field=value`) and their defaults:", ""]
+    for name, default, meaning in _fields(schema, values, ""):
+        lines += _entry(f"{name}={default}", meaning, 2, 44)
+    return "\n".join(lines) + "\n"
+
+
+def _entry(head: str, text: str, indent: int, column: int) -> list[str]:
+    first = " " * indent + head
+    start = f"{first:<{column}}" if len(first) < column else f"{first}  "
+    return textwrap.wrap(text, _WIDTH, initial_indent=start, subsequent_indent=" " * column) or [first]
+
+
+def _fields(schema: type, values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, str, str]]:
+    """Name, default and meaning of every field; fields of nested configurations follow theirs."""
+    meanings, kinds = _meanings(schema), typing.get_type_hints(schema)
+    for field in dataclasses.fields(schema):
+        value = values.get(field.name)
+        meaning = meanings.get(field.name, "")
+        if isinstance(value, Mapping):
+            nested = next((kind for kind in (kinds[field.name], *typing.get_args(kinds[field.name])) if _is_schema(kind)), None)
+            if nested is not None:
+                yield from _fields(nested, value, f"{prefix}{field.name}.")
+                continue
+        allowed = typing.get_args(kinds[field.name]) if typing.get_origin(kinds[field.name]) is typing.Literal else ()
+        if allowed:
+            meaning = f"{meaning.rstrip('.')} [{', '.join(map(str, allowed))}]"
+        yield prefix + field.name, _shown(value), meaning.strip()
+
+
+def _is_schema(kind: object) -> bool:
+    return isinstance(kind, type) and dataclasses.is_dataclass(kind)
+
+
+def _shown(value: object) -> str:
+    if value is None or value == "":
+        return "null" if value is None else "''"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "[" + ", ".join(_shown(one) for one in value) + "]" if isinstance(value, list | tuple) else str(value)
+
+
+def _meanings(schema: type) -> dict[str, str]:
+    """Texts of a docstring's `Attributes:` section by field."""
+    _, _, section = textwrap.dedent((schema.__doc__ or "").partition("\n")[2]).partition("Attributes:\n")
+    found: dict[str, str] = {}
+    names: tuple[str, ...] = ()
+    for line in section.splitlines():
+        if line and not line.startswith(" "):
+            break
+        entry = _ENTRY.match(line[4:]) if line.startswith("    ") and not line.startswith("     ") else None
+        if entry is not None:
+            names = tuple(entry[1].split(", "))
+            found |= dict.fromkeys(names, entry[2])
+        else:
+            found |= {name: f"{found[name]} {line.strip()}".strip() for name in names}
+    return found
