@@ -97,8 +97,9 @@ def _slow(script: Script, wrists: dict[int, Array]) -> float:
 
 def walk(script: Script) -> Phrases:
     """Walks ahead, at one of three paces, straight or along a curve."""
-    pace, word = [(0.8, "slowly"), (1.0, ""), (1.15, "quickly")][int(script.rng.integers(3))]
-    turn = float(script.rng.choice([0.0, 0.0, 0.9, -0.9]))
+    pace, word = [(0.8, "slowly"), (1.0, ""), (1.25, "quickly")][int(script.rng.integers(3))]
+    pace *= float(script.rng.uniform(0.92, 1.08))
+    turn = float(script.rng.choice([0.0, 0.0, 1.0, -1.0])) * float(script.rng.uniform(0.6, 1.5))
     script.walk(float(script.rng.uniform(0.8, 2.4)), turn_rad=turn, pace=pace)
     curve = "" if turn == 0.0 else f" in a curve to the {_SIDES[int(turn < 0)]}"
     word = f" {word}" if word else ""
@@ -115,7 +116,8 @@ def turn(script: Script) -> Phrases:
     """Turns in place by 45 to 180 degrees."""
     degrees = int(script.rng.choice([45, 90, 135, 180]))
     side = int(script.rng.integers(2))
-    script.walk(0.0, turn_rad=np.deg2rad(degrees) * (1 if side == 0 else -1))
+    pace = float(script.rng.uniform(0.85, 1.35))
+    script.walk(0.0, turn_rad=np.deg2rad(degrees) * (1 if side == 0 else -1), pace=pace)
     name = _SIDES[side]
     around = "turns around" if degrees == 180 else f"turns {degrees} degrees"
     return [f"{around} to the {name}", f"turns to the {name}", f"rotates {name} in place"]
@@ -312,6 +314,33 @@ def carry(script: Script) -> Phrases:
         f"steps {where} while holding {thing} in both hands",
         f"moves {thing} {where} with both arms",
     ]
+
+
+def roam(script: Script) -> Phrases:
+    """Steps about in all directions, turning, with something in both hands or with the hands moving on the way."""
+    carries = script.rng.random() < 0.5
+    for _ in range(int(script.rng.integers(2, 5))):
+        seconds = float(script.rng.uniform(0.8, 1.4))
+        if carries:
+            _both(script, _held(script), seconds)
+        for side in () if carries else (0, 1):
+            x, y, z = script.rng.uniform((0.0, 0.2, 0.85), (0.45, 0.5, 1.6))
+            wrist = np.array([max(x, 0.25) if y < 0.4 else x, y if side == 0 else -y, z])
+            script.hand(side, wrist if script.rng.random() < 0.6 else None, seconds, advance=False)
+        script.trunk(float(script.rng.uniform(-0.25, 0.25)), 0.0, seconds, advance=False)
+        script.posture(float(script.rng.uniform(0.0, 0.06)), float(script.rng.uniform(-0.05, 0.3)), seconds, advance=False)
+        distance = float(script.rng.uniform(0.0, 0.8))
+        way = float(script.rng.uniform(-np.pi, np.pi))
+        script.walk(
+            distance, direction_rad=way, turn_rad=float(script.rng.uniform(-1.6, 1.6)), pace=float(script.rng.uniform(0.9, 1.4))
+        )
+    for side in (0, 1):
+        script.hand(side, None, 0.9, advance=False)
+    _stand(script, 0.9)
+    if carries:
+        thing = _thing(script, 2)
+        return [f"steps about with {thing} in both hands", f"turns here and there while carrying {thing}"]
+    return ["steps about and turns, moving the arms", "walks to and fro in a small space", "steps around with both arms moving"]
 
 
 def shift(script: Script) -> Phrases:
@@ -622,6 +651,7 @@ ACTIVITIES: Final[Mapping[str, Activity]] = {
     "put_down": put_down,
     "look_around": look_around,
     "gesture": gesture,
+    "roam": roam,
     "shift": shift,
     "spread": spread,
     "stretch": stretch,
@@ -658,6 +688,12 @@ RECIPES: Final[tuple[tuple[str, ...], ...]] = (
     ("gesture", "walk"),
     ("walk", "gesture"),
     ("gesture", "reach"),
+    ("roam", "reach"),
+    ("lift", "roam"),
+    ("pick", "roam"),
+    ("roam", "gesture"),
+    ("roam", "put_down"),
+    ("roam", "walk"),
     ("lift", "shift"),
     ("carry", "shift"),
     ("lift", "carry"),

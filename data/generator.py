@@ -27,7 +27,7 @@ __all__ = ["GENERATOR_VERSION", "generate_clip", "write_dataset"]
 
 Array = NDArray[np.float64]
 #: Raised when the same seed gives other clips than before.
-GENERATOR_VERSION: Final = 3
+GENERATOR_VERSION: Final = 4
 _DURATION_S: Final = (2.0, 10.0)
 #: Nothing in a household is faster; an arm that folds close by its shoulder can be.
 _FASTEST_M_S: Final = 5.0

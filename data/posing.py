@@ -57,7 +57,8 @@ class Channels:
         pelvis_height_m: (T,) wanted pelvis height; lowered where the legs are too short.
         lean_rad: (T,) forward lean of the trunk.
         side_rad: (T,) lean of the trunk to the right.
-        twist_rad: (T,) turn of the chest to the left of the pelvis.
+        twist_rad: (T,) turn of the chest to the left of the base's heading.
+        hip_rad: (T,) turn of the pelvis to the left of it.
         sway_m: (T, 2) shift of the pelvis ahead and to the left of the base.
         feet: (T, 2, 4) left and right ankle x, y, z (m) and foot yaw (rad) in the world.
         hands: (T, 2, 3) left and right wrist in the base frame (x forward, y left, z above the floor).
@@ -69,6 +70,7 @@ class Channels:
     lean_rad: Array
     side_rad: Array
     twist_rad: Array
+    hip_rad: Array
     sway_m: Array
     feet: Array
     hands: Array
@@ -104,8 +106,8 @@ def pose(channels: Channels) -> Array:
     frames = len(channels.base)
     joints = np.zeros((frames, len(JOINTS), 3))
     yaw, lean, side_lean = channels.base[:, 2], channels.lean_rad, channels.side_rad
-    # The pelvis takes a third of the lean and a little of the twist, the spine the rest.
-    pelvis_rotation = _rotation(yaw + 0.2 * channels.twist_rad, 0.35 * lean, 0.2 * side_lean)
+    # The pelvis takes a third of the lean, the spine the rest.
+    pelvis_rotation = _rotation(yaw + channels.hip_rad, 0.35 * lean, 0.2 * side_lean)
     spine_rotation = _rotation(yaw + channels.twist_rad, lean, side_lean)
     # The hips shift back when the trunk leans forward, as balance needs.
     ahead = channels.sway_m[:, 0] - 0.16 * np.sin(lean)

@@ -86,6 +86,8 @@ class _Habits:
         toe_out_rad: of each foot.
         lean_rad, side_rad, twist_rad: of the trunk.
         stride: length of steps as a share of the usual one.
+        hip_share: how much of the chest's turn the pelvis takes.
+        hip_rad_m: turn of the pelvis with the swing of the hands.
         hang: (2, 3) wrists hanging at the sides, in the base frame.
     """
 
@@ -97,6 +99,8 @@ class _Habits:
         self.side_rad = float(np.clip(rng.normal(0.0, 0.03), -0.08, 0.08))
         self.twist_rad = float(np.clip(rng.normal(0.0, 0.06), -0.15, 0.15))
         self.stride = float(rng.uniform(0.75, 1.2))
+        self.hip_share = float(rng.uniform(0.15, 0.6))
+        self.hip_rad_m = float(rng.uniform(0.1, 1.2))
         self.hang = np.stack([_hanging(rng, sign) for sign in (1.0, -1.0)])
 
     def foot(self, place: Array, side: int) -> Array:
@@ -163,7 +167,7 @@ class Script:
         stride = 0.37 * self._habits.stride
         if abs(np.cos(direction_rad)) <= 0.7:  # sideways one foot must not step over the other
             stride = min(0.68 * stride, max(2.0 * self._habits.spread_m - 0.1, 0.1))
-        steps = max(2, int(np.ceil(max(distance_m / stride, abs(turn_rad) / 0.55))))
+        steps = max(2, int(np.ceil(max(distance_m / stride, abs(turn_rad) / float(self.rng.uniform(0.45, 0.75))))))
         first = int(self.rng.integers(2))
         if abs(turn_rad) > 0.2:
             first = 0 if turn_rad > 0 else 1
@@ -244,6 +248,8 @@ class Script:
         lean = self._lean.sample(times)[:, 0] + habits.lean_rad + _DRIFT_RAD * drift[:, 0]
         side_lean = self._side.sample(times)[:, 0] + habits.side_rad + _DRIFT_RAD * drift[:, 1]
         twist = self._twist.sample(times)[:, 0] + habits.twist_rad + 2.0 * _DRIFT_RAD * drift[:, 2]
+        hip = habits.hip_share * twist + 2.0 * _DRIFT_RAD * drift[:, 13]
+        hip -= habits.hip_rad_m * 0.5 * (swing[:, 1] - swing[:, 0])  # the hip goes ahead with its leg
         twist += _COUNTER_RAD_M * 0.5 * (swing[:, 1] - swing[:, 0])
         sway = np.column_stack([np.zeros_like(weight), weight]) + _DRIFT_M * drift[:, 3:5]
         height = self._height.sample(times)[:, 0] + bob
@@ -266,7 +272,7 @@ class Script:
         hands[:, :, 2] += free[:, :, 0] * 0.25 * np.abs(swing)
         swivel = np.concatenate([track.sample(times) for track in self._swivel], axis=1) + 0.1 * drift[:, 11:13]
         opening = np.concatenate([track.sample(times) for track in self._opening], axis=1)
-        return pose(Channels(base, height, lean, side_lean, twist, sway, feet, hands, swivel)), opening
+        return pose(Channels(base, height, lean, side_lean, twist, hip, sway, feet, hands, swivel)), opening
 
     def _locomotion(self, times: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Base (T, 3), feet (T, 2, 4), swing of the hands (T, 2), shift of the weight to the left (T,), rise (T,)."""
@@ -307,7 +313,7 @@ class Script:
 class _Drift:
     """Slow random values in [-1, 1] that never repeat: sums of three sines each."""
 
-    def __init__(self, rng: np.random.Generator, channels: int = 13) -> None:
+    def __init__(self, rng: np.random.Generator, channels: int = 14) -> None:
         self._frequency = rng.uniform(*_DRIFT_HZ, size=(3, channels))
         self._phase = rng.uniform(0.0, 2.0 * np.pi, size=(3, channels))
 
