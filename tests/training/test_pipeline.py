@@ -125,7 +125,7 @@ def test_current_stages_are_skipped_and_others_are_not(trained: Pipeline) -> Non
 
 def test_a_new_recipe_makes_older_output_stale(trained: Pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     before = {name: trained.key(name) for name in ("base", "corrections", "tokenizer", "alignment", "selu")}
-    monkeypatch.setattr(pipeline_module, "RECIPES", {"base": 99, "alignment": 1, "selu": 1})
+    monkeypatch.setattr(pipeline_module, "RECIPES", dict(pipeline_module.RECIPES) | {"base": 99, "alignment": 1, "selu": 1})
     changed = {name for name in before if trained.key(name) != before[name]}
     assert changed == {"base", "corrections", "alignment", "selu"}
 
