@@ -8,7 +8,7 @@ Paper: none; part of the generator of motions. The vocabulary follows HumanML3D'
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
 import numpy as np
@@ -87,6 +87,13 @@ def _go(script: Script, wrists: dict[int, Array], seconds: float) -> None:
 def _stand(script: Script, seconds: float) -> None:
     script.trunk(0.0, 0.0, seconds, advance=False)
     script.posture(0.0, 0.0, seconds)
+
+
+def _rest(script: Script, sides: Iterable[int], seconds: float) -> None:
+    """Lets hands hang and straightens up."""
+    for side in sides:
+        script.hand(side, None, seconds, advance=False)
+    _stand(script, seconds)
 
 
 def _slow(script: Script, wrists: dict[int, Array]) -> float:
@@ -211,8 +218,7 @@ def reach(script: Script) -> Phrases:
     seconds = _slow(script, wrists)
     _go(script, wrists, seconds)
     script.wait(float(script.rng.uniform(0.2, 0.5)))
-    script.hand(side, None, seconds, advance=False)
-    _stand(script, seconds)
+    _rest(script, (side,), seconds)
     name = _SIDES[side]
     return [
         f"reaches out with the {name} hand {height}{where}",
@@ -233,9 +239,7 @@ def reach_both(script: Script) -> Phrases:
     seconds = _slow(script, wrists)
     _go(script, wrists, seconds)
     script.wait(float(script.rng.uniform(0.2, 0.5)))
-    for side in (0, 1):
-        script.hand(side, None, seconds, advance=False)
-    _stand(script, seconds)
+    _rest(script, (0, 1), seconds)
     return [
         f"reaches out with both hands {height}",
         f"extends both arms {height} and lowers them",
@@ -275,8 +279,7 @@ def place(script: Script) -> Phrases:
     _go(script, wrists, seconds)
     script.grip(side, 1.0)
     script.wait(0.35)
-    script.hand(side, None, seconds, advance=False)
-    _stand(script, seconds)
+    _rest(script, (side,), seconds)
     name, thing = _SIDES[side], _thing(script, 1)
     return [
         f"puts down {thing} {height}{where} with the {name} hand",
@@ -334,9 +337,7 @@ def roam(script: Script) -> Phrases:
         script.walk(
             distance, direction_rad=way, turn_rad=float(script.rng.uniform(-1.6, 1.6)), pace=float(script.rng.uniform(0.9, 1.4))
         )
-    for side in (0, 1):
-        script.hand(side, None, 0.9, advance=False)
-    _stand(script, 0.9)
+    _rest(script, (0, 1), 0.9)
     if carries:
         thing = _thing(script, 2)
         return [f"steps about with {thing} in both hands", f"turns here and there while carrying {thing}"]
@@ -358,9 +359,7 @@ def shift(script: Script) -> Phrases:
         script.trunk(sign * float(script.rng.uniform(0.3, 0.6)), 0.0, seconds, advance=False)
         script.posture(drop, lean, seconds)
         script.wait(float(script.rng.uniform(0.1, 0.4)))
-    for side in (0, 1):
-        script.hand(side, None, 0.9, advance=False)
-    _stand(script, 0.9)
+    _rest(script, (0, 1), 0.9)
     name, other, thing = _SIDES[start], _SIDES[1 - start], _thing(script, 2)
     return [
         f"moves {thing} from the {name} to the {other} with both hands",
@@ -386,9 +385,7 @@ def spread(script: Script) -> Phrases:
         script.trunk(float(script.rng.uniform(-0.15, 0.15)), bow, seconds)
         script.wait(float(script.rng.uniform(0.3, 1.2)))
         raised = float(np.clip(raised + script.rng.uniform(-0.6, 0.6), -0.95, 0.85))
-    for side in sides:
-        script.hand(side, None, 0.9, advance=False)
-    _stand(script, 0.9)
+    _rest(script, sides, 0.9)
     if len(sides) == 2:
         return [
             "spreads both arms out to the sides",
@@ -419,9 +416,7 @@ def stretch(script: Script) -> Phrases:
     for side, sign in ((0, 1.0), (1, -1.0)):
         script.hand_path(side, [ahead * [1.0, sign, 1.0]], 0.8)
     script.wait(0.8)
-    for side in (0, 1):
-        script.hand(side, None, 0.8, advance=False)
-    _stand(script, 0.8)
+    _rest(script, (0, 1), 0.8)
     return [
         "stretches both arms above the head",
         "reaches up high with both hands and bends sideways",
@@ -441,8 +436,6 @@ def lift(script: Script) -> Phrases:
     for side in (0, 1):
         script.grip(side, 0.3)
     script.wait(0.35)
-    for side in (0, 1):
-        script.grip(side, 0.3)
     _both(script, _held(script, float(left[1])), seconds)
     _stand(script, seconds)
     thing = _thing(script, 2)
@@ -465,8 +458,7 @@ def _along(script: Script, side: int, start_x: float, end_x: float) -> str:
     _go(script, {side: last}, float(script.rng.uniform(0.9, 1.3)))
     script.grip(side, 0.6)
     script.wait(0.25)
-    script.hand(side, None, 0.9, advance=False)
-    _stand(script, 0.9)
+    _rest(script, (side,), 0.9)
     return height
 
 
@@ -517,8 +509,7 @@ def open_door(script: Script) -> Phrases:
     _sweep(script, side, arc[1:], float(script.rng.uniform(1.1, 1.6)))
     script.grip(side, 0.7)
     script.wait(0.2)
-    script.hand(side, None, 0.9, advance=False)
-    _stand(script, 0.9)
+    _rest(script, (side,), 0.9)
     name, thing = _SIDES[side], _choice(script, ("a cabinet door", "a fridge", "a cupboard"))
     return [f"opens {thing} with the {name} hand", f"pulls {thing} open {height} with the {name} hand"]
 
@@ -531,8 +522,7 @@ def close_door(script: Script) -> Phrases:
     _go(script, {side: arc[0]}, float(script.rng.uniform(0.8, 1.1)))
     _sweep(script, side, arc[1:], float(script.rng.uniform(0.9, 1.4)))
     script.wait(0.2)
-    script.hand(side, None, 0.9, advance=False)
-    _stand(script, 0.9)
+    _rest(script, (side,), 0.9)
     name, thing = _SIDES[side], _choice(script, ("a cabinet door", "a fridge", "a cupboard"))
     return [f"closes {thing} with the {name} hand", f"pushes {thing} shut {height} with the {name} hand"]
 
@@ -576,8 +566,7 @@ def wipe(script: Script) -> Phrases:
     for _ in range(int(script.rng.integers(2, 5))):
         for shift in (0.13, -0.13):
             script.hand(side, centre + np.array([float(script.rng.uniform(-0.04, 0.04)), shift * sign, 0.0]), 0.35)
-    script.hand(side, None, 0.9, advance=False)
-    _stand(script, 0.9)
+    _rest(script, (side,), 0.9)
     name, thing = _SIDES[side], _choice(script, ("a table", "a counter", "a surface"))
     return [
         f"wipes {thing} {height} with the {name} hand",
@@ -601,9 +590,7 @@ def put_down(script: Script) -> Phrases:
     for side in (0, 1):
         script.grip(side, 0.9)
     script.wait(0.35)
-    for side in (0, 1):
-        script.hand(side, None, seconds, advance=False)
-    _stand(script, seconds)
+    _rest(script, (0, 1), seconds)
     thing = _thing(script, 2)
     return [
         f"sets {thing} down {height} with both hands",

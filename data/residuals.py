@@ -23,7 +23,7 @@ from sim.robots.kinematics import RobotModel
 from sim.robots.self_collision import close_rows, default_shapes, moved_by, solid_on
 from sim.robots.spec import SIDES
 
-__all__ = ["BodyFrames", "Residuals", "wrist_frame"]
+__all__ = ["BodyFrames", "Residuals"]
 
 Array = NDArray[np.float64]
 _PELVIS: Final = 6.0
@@ -201,12 +201,6 @@ class _Apart:
             return None
         rows, gaps = close_rows(self._results, self._data, self._moves, _APART_M)
         return -rows, np.maximum(gaps - _APART_M, -_DEEPEST_M)
-
-
-def wrist_frame(robot: RobotModel, side: str) -> int:
-    """The frame of the last joint of an arm."""
-    joint = robot.model.getJointId(robot.spec.arms[side].joints[-1])
-    return next(i for i, f in enumerate(robot.model.frames) if f.type == pin.FrameType.JOINT and f.parentJoint == joint)
 
 
 def _leg_side(robot: RobotModel, joint: int) -> str:

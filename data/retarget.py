@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from data.least_squares import BoundedSearch, System
 from data.motion import FPS, encode_frames, resample
 from data.records import Motion
-from data.residuals import BodyFrames, Residuals, wrist_frame
+from data.residuals import BodyFrames, Residuals
 from data.self_contact import SelfContact
 from data.skeleton import HumanMotion
 from data.targets import Measures, Targets, make_targets
@@ -114,7 +114,7 @@ class Retargeter:
         self._pelvis = frame(spec.root_body)
         self._soles = [frame(f"{side}_sole") for side in ("left", "right")]
         self._arm_frames = [
-            (frame(keys[f"{side}_shoulder"]), frame(keys[f"{side}_elbow"]), wrist_frame(self.robot, side))
+            (frame(keys[f"{side}_shoulder"]), frame(keys[f"{side}_elbow"]), _wrist_frame(self.robot, side))
             for side in ("left", "right")
         ]
         self._measure()
@@ -227,6 +227,12 @@ class Retargeter:
             step = MAX_JOINT_VELOCITY / FPS * 0.999
             lower, upper = np.maximum(lower, q[self._q_columns] - step), np.minimum(upper, q[self._q_columns] + step)
         return self._search(q, system, lower, upper, _FIRST_ITERATIONS if first else self.iterations)
+
+
+def _wrist_frame(robot: RobotModel, side: str) -> int:
+    """The frame of the last joint of an arm."""
+    joint = robot.model.getJointId(robot.spec.arms[side].joints[-1])
+    return next(i for i, f in enumerate(robot.model.frames) if f.type == pin.FrameType.JOINT and f.parentJoint == joint)
 
 
 def _distance(a: Array, b: Array) -> float:

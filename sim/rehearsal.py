@@ -6,7 +6,8 @@ exactly. Privileged: only the expert uses it. Paper: none; it keeps the expert's
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Final
 
 import mujoco
@@ -60,35 +61,35 @@ class Rehearsal:
             actions: the same action for different arms.
             stance: where the robot would stand.
         """
-        world, body = self._session.world, self._session.body
-        height = body.pelvis_height_m
-        saved = world.save()
-        body.hurried = True
-        try:
+        height = self._session.body.pelvis_height_m
+        with self._in_thought():
             for candidate in self._heights(actions, stance, height):
                 self._put(stance, candidate)
                 if any(self._session.assess(action) is None for action in actions):
                     return True
-        finally:
-            body.hurried = False
-            world.restore(saved)
         return False
 
     def works_together(self, pairs: Sequence[tuple[Action, Action]], stance: Stance) -> bool:
         """Whether two actions would both be tried from a stance at some height, for one of some choices of arms."""
-        world, body = self._session.world, self._session.body
-        saved = world.save()
-        body.hurried = True
-        try:
+        with self._in_thought():
             hopeful = [(h, pair) for h in self.heights_m() for pair in pairs if all(self._within(a, stance, h) for a in pair)]
             for height, pair in hopeful[:_TOGETHER]:
                 self._put(stance, height)
                 if all(self._session.assess(action) is None for action in pair):
                     return True
+        return False
+
+    @contextmanager
+    def _in_thought(self) -> Iterator[None]:
+        """What is moved inside stands where it was at the end, and the body plans in a hurry meanwhile."""
+        world, body = self._session.world, self._session.body
+        saved = world.save()
+        body.hurried = True
+        try:
+            yield
         finally:
             body.hurried = False
             world.restore(saved)
-        return False
 
     def _within(self, action: Action, stance: Stance, height_m: float) -> bool:
         """Whether an action's object is within the arm's envelope; where something is put is not known yet."""
@@ -107,10 +108,7 @@ class Rehearsal:
             stance: where the robot would stand.
             height_m: pelvis height.
         """
-        world, body = self._session.world, self._session.body
-        saved = world.save()
-        body.hurried = True
-        try:
+        with self._in_thought():
             self._put(stance, height_m)
             if self._session.assess(first) is not None:
                 return False
@@ -118,10 +116,7 @@ class Rehearsal:
                 return True
             self._pull_open(first.object_id)
             known = {*self._session.known_objects, first.object_id, then.object_id or first.object_id}
-            return assess_action(body, then, frozenset(known)) is None
-        finally:
-            body.hurried = False
-            world.restore(saved)
+            return assess_action(self._session.body, then, frozenset(known)) is None
 
     def _pull_open(self, object_id: str) -> None:
         """Puts a door or a drawer wide open; what lies in a drawer comes along."""

@@ -172,13 +172,21 @@ def _fill(b: Builder) -> None:
 
 
 def _slice(b: Builder) -> None:
-    a = b.small(among=_FOOD_STEADY)
+    _ask_sliced(b, _FOOD_STEADY)
+
+
+def _clean(b: Builder) -> None:
+    _ask_clean(b, _DISHES_STEADY)
+
+
+def _ask_sliced(b: Builder, food: Sequence[str]) -> None:
+    a = b.small(among=food)
     knife = b.small(among=_KNIVES)
     b.ask(Predicate("sliced", a), a=a, b=knife)
 
 
-def _clean(b: Builder) -> None:
-    a = b.small(among=_DISHES_STEADY)
+def _ask_clean(b: Builder, dishes: Sequence[str]) -> None:
+    a = b.small(among=dishes)
     sponge = b.small(among=_WIPERS)
     b.start(a, isDirty=True)
     b.ask(Predicate("clean", a), a=a, b=sponge)
@@ -376,16 +384,11 @@ def _fetch_ajar(b: Builder) -> None:
 
 
 def _slice_steady(b: Builder) -> None:
-    a = b.small(among=_FOOD_ROLLING)
-    knife = b.small(among=_KNIVES)
-    b.ask(Predicate("sliced", a), a=a, b=knife)
+    _ask_sliced(b, _FOOD_ROLLING)
 
 
 def _clean_steady(b: Builder) -> None:
-    a = b.small(among=_DISHES_SLIDING)
-    sponge = b.small(among=_WIPERS)
-    b.start(a, isDirty=True)
-    b.ask(Predicate("clean", a), a=a, b=sponge)
+    _ask_clean(b, _DISHES_SLIDING)
 
 
 def _pour_hold(b: Builder) -> None:
