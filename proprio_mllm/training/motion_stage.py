@@ -5,7 +5,8 @@ serves both robots.
 
 Of a frame's 48 numbers 42 are key bodies, so that a loss that weighs all alike gives up the two hand openings, which tell what
 the robot holds. `FEATURE_BIAS` lets single features count more, as the feature bias of HumanML3D's own normalisation does for
-the root and the foot contacts; the paper does not say how it normalises.
+the root and the foot contacts; the paper does not say how it normalises. `VARIED` of the windows of clips are shown in another
+posture (`posture.py`), because people move in more ways than the generated corpus does.
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ from configs.schema.model import MotionTokenizerConfig
 from data.motion import FPS, HAND_OPENING, KEY_BODY_COUNT, N_FEATURES, OPEN_HAND, PELVIS_HEIGHT
 from proprio_mllm.model.geometry import KEY_BODIES
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.training.posture import in_other_postures
 from proprio_mllm.training.sources import Clips, held_out
 
 __all__ = [
     "FEATURE_BIAS",
+    "VARIED",
     "MotionObjective",
     "MotionWindows",
     "bits_per_s",
@@ -38,6 +41,8 @@ __all__ = [
 FEATURE_BIAS = np.ones(N_FEATURES, dtype=np.float32)
 FEATURE_BIAS[PELVIS_HEIGHT] = 1.5
 FEATURE_BIAS[HAND_OPENING] = 3.0
+#: Share of the training windows of clips that are put in another posture.
+VARIED = 0.6
 _HANDS = [i for i, name in enumerate(KEY_BODIES) if name.endswith("hand")]
 _FEET = [i for i, name in enumerate(KEY_BODIES) if name.endswith("ankle")]
 
@@ -55,14 +60,27 @@ class MotionWindows:
             self.train, self.test = rows[~mask], rows[mask]
 
     def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.float32]:
-        """Training windows (size, frames, F)."""
-        out = []
-        for _ in range(size):
-            if len(self.train) == 0 or rng.random() < self.clip_share:
-                out.append(self.clips.window(int(rng.choice(self.clips.split.train)), self.frames, rng))
-            else:
-                out.append(self.train[int(rng.integers(len(self.train)))])
-        return np.stack(out)
+        """Training windows (size, frames, F) as they are."""
+        return self._draw(rng, size)[0]
+
+    def draw_varied(self, rng: np.random.Generator, size: int) -> NDArray[np.float32]:
+        """Training windows (size, frames, F), `VARIED` of those of clips in another posture."""
+        windows, of_clip = self._draw(rng, size)
+        varied = of_clip & (rng.random(size) < VARIED)
+        if varied.any():
+            windows[varied] = in_other_postures(windows[varied], rng)
+        return windows
+
+    def _draw(self, rng: np.random.Generator, size: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Windows (size, frames, F), and which of them are of clips."""
+        of_clip = np.array([len(self.train) == 0 or rng.random() < self.clip_share for _ in range(size)], dtype=bool)
+        windows = [
+            self.clips.window(int(rng.choice(self.clips.split.train)), self.frames, rng)
+            if clip
+            else self.train[int(rng.integers(len(self.train)))]
+            for clip in of_clip
+        ]
+        return np.stack(windows), of_clip
 
     def statistics(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Mean and scale (F,) of all training frames, clips and windows weighted alike.
@@ -91,7 +109,7 @@ class MotionObjective:
 
     def batch(self, rng: np.random.Generator, size: int) -> Tensor:
         """Windows (B, T, F)."""
-        return torch.from_numpy(self._windows.draw(rng, size))
+        return torch.from_numpy(self._windows.draw_varied(rng, size))
 
     def loss(self, module: nn.Module, batch: Tensor, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
         """The paper's loss; dead codes are replaced by vectors drawn with `generator`."""

@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 Metrics = dict[str, float]
 
 #: Raised when what a stage trains on changes in code, so that older output is not taken for current.
-RECIPES: Final[Mapping[str, int]] = {"base": 3, "tokenizer": 1, "alignment": 5, "selu": 4}
+RECIPES: Final[Mapping[str, int]] = {"base": 3, "tokenizer": 2, "alignment": 5, "selu": 4}
 #: Stages whose current output a stage starts from.
 NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
     "corrections": ("base",),
@@ -106,8 +106,9 @@ class Pipeline:
     def key(self, name: str) -> str:
         """Key of a stage's output under the present configuration and inputs."""
         cfg, shards = self.cfg, self.paths.shards
-        plain = dataclasses.asdict(base_model_config(cfg.model))
         if name == "base":
+            # no stage before it, and no motion in its prompts: of the tokenizer it has the words alone
+            plain = dataclasses.asdict(base_model_config(cfg.model)) | {"motion": cfg.model.motion.vocabulary}
             inputs = {kind: shard_hash(shards(kind)) for kind in ("views", "exercises", "demos", "clips")}
             wanted = {"base": dataclasses.asdict(cfg.base), "model": plain, "recipe": RECIPES["base"]}
             return stage_key(wanted, cfg.seed, inputs)
