@@ -1,0 +1,1 @@
+"""Language models that answer chats: an OpenAI-compatible server, a model in this process, recorded replies, a script."""
