@@ -58,12 +58,15 @@ def main(overrides: Sequence[str]) -> int:
             table.show()
         return 0
     try:
-        folder = evaluate(cfg).folder
+        done = evaluate(cfg)
     except (WeightsError, ValueError) as error:
         console.print(f"eval.py: {error}", style="red", markup=False, soft_wrap=True)
         return 1 if isinstance(error, WeightsError) else 2
+    folder = done.folder
     run = load_run(folder)
     table = write_report(run)
+    if done.stopped:
+        console.print(f"eval.py: the run has stopped: {done.stopped}", style="red", markup=False, soft_wrap=True)
     console.print(f"ledger, summary.json and tables: {folder}", markup=False, soft_wrap=True)
     table.show()
     return 0 if run.complete else 1

@@ -457,6 +457,10 @@ class EpisodeRecord:
         planner_calls, planner_tokens, planner_s, wall_s: cost.
         trace: per step, the step text, its outcome codes and margins.
         message: error text of an infrastructure error.
+        cached_calls: calls that a reply cache answered.
+        reflections: calls that reflected on a failure.
+        planner_usd: price of all calls when they were made, None where it is not known.
+        models: exact language models that answered.
     """
 
     planner: str
@@ -482,3 +486,7 @@ class EpisodeRecord:
     wall_s: float
     trace: tuple[Mapping[str, object], ...] = ()
     message: str = ""
+    cached_calls: int = 0
+    reflections: int = 0
+    planner_usd: float | None = 0.0
+    models: tuple[str, ...] = ()

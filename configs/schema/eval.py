@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
+from configs.schema.backend import BackendConfig
 from configs.schema.robot import RobotConfig
 
 __all__ = [
+    "CHAT_KINDS",
     "CategoryName",
     "DifficultyName",
     "EvalConfig",
     "ExperimentConfig",
     "ExperimentName",
     "PlannerConfig",
+    "PlannerKind",
     "SplitName",
     "StartName",
 ]
@@ -23,6 +26,9 @@ DifficultyName = Literal["easy", "medium", "hard", "natural"]
 SplitName = Literal["all", "seen", "unseen"]
 SchedulerName = Literal["local", "ray"]
 StartName = Literal["fixed", "turned", "random"]
+PlannerKind = Literal["mllm", "file", "random", "scripted", "expert", "plain", "llm_planner", "rap", "dag_plan"]
+#: Kinds that ask a language model in chats, and so need a backend.
+CHAT_KINDS: Final[tuple[PlannerKind, ...]] = ("plain", "llm_planner", "rap", "dag_plan")
 ExperimentName = Literal["main_table", "ablation_table", "replanning_table", "failure_figure", "distribution_figures"]
 
 
@@ -38,7 +44,8 @@ class PlannerConfig:
     Attributes:
         name: name in commands, ledgers and tables.
         kind: `mllm` runs a stored model, `file` a class in a Python file, `random` draws legal actions, `scripted` follows
-            rules, `expert` looks into the simulator (privileged).
+            rules, `expert` looks into the simulator (privileged); `plain`, `llm_planner`, `rap` and `dag_plan` ask the run's
+            backend.
         label: name printed in tables.
         weights: folder of a stored model; needed for `mllm`.
         source: `FILE.py:CLASS`; needed for `file`.
@@ -46,11 +53,19 @@ class PlannerConfig:
         train: command that makes the weights, for the message when they are absent.
         temperature: 0 takes the most likely token.
         max_new_tokens: longest reply.
-        image_size: side of the head view in pixels for planners that bring no model; a model brings its own.
+        image_size: side of the head view in pixels for planners that bring no model; a model or a backend brings its own.
+        reflection: `on` reflects on failures. Planners of a backend ask once more for cause, change and new steps; a stored
+            model reads its failed steps in the log, which `off` leaves out.
+        replans: most re-plans, reflecting or not, of an episode.
+        horizon: steps of a reply of `plain` that are carried out before it asks again.
+        history: steps of the log in a backend's prompt.
+        body: whether a backend's prompt tells proprioception in words; the paper's baselines have none.
+        examples: tasks taken from memory by `llm_planner` and `rap`.
+        memory: folder of the memory, made by `python -m proprio_mllm.planners.memory`.
     """
 
     name: str
-    kind: Literal["mllm", "file", "random", "scripted", "expert"]
+    kind: PlannerKind
     label: str
     weights: str | None = None
     source: str | None = None
@@ -59,6 +74,13 @@ class PlannerConfig:
     temperature: float = 0.0
     max_new_tokens: int = 48
     image_size: int = 112
+    reflection: Literal["on", "off"] = "on"
+    replans: int = 5
+    horizon: int = 1
+    history: int = 20
+    body: bool = False
+    examples: int = 0
+    memory: str | None = None
 
     def __post_init__(self) -> None:
         _require(self.name.isidentifier(), f"planner name {self.name!r} must be an identifier")
@@ -66,6 +88,15 @@ class PlannerConfig:
         _require((self.source is not None) == (self.kind == "file"), f"kind {self.kind!r} with source {self.source!r}")
         _require(self.temperature >= 0.0, f"temperature {self.temperature} must not be negative")
         _require(self.max_new_tokens > 0, f"max_new_tokens {self.max_new_tokens} must be positive")
+        _require(
+            self.reflection == "on" or self.kind in ("mllm", *CHAT_KINDS),
+            f"reflection {self.reflection!r} with planner kind {self.kind!r}, which has none; allowed: on",
+        )
+        for name, low in (("replans", 0), ("horizon", 1), ("history", 1), ("examples", 0)):
+            _require(getattr(self, name) >= low, f"{name} {getattr(self, name)} must be at least {low}")
+        needs = self.kind in ("llm_planner", "rap")
+        _require((self.memory is not None) == needs, f"kind {self.kind!r} with memory {self.memory!r}")
+        _require((self.examples > 0) == needs, f"kind {self.kind!r} with examples {self.examples}")
 
 
 @dataclass(frozen=True)
@@ -110,6 +141,10 @@ class EvalConfig:
         retries: how often an episode with an infrastructure error is run again.
         output: folder of all outputs.
         experiment: assemble this instead of running episodes.
+        backend: the language model that planners which chat ask; others have none.
+        threads: episodes that go on at a time in one process (`workers=0`), each with a planner of its own whose calls wait
+            in a thread; for planners that ask a backend.
+        cost_cap_usd: most money a run may spend, over all its parts; null sets no limit.
     """
 
     planner: PlannerConfig
@@ -130,6 +165,9 @@ class EvalConfig:
     retries: int = 1
     output: str = "outputs"
     experiment: ExperimentConfig | None = None
+    backend: BackendConfig | None = None
+    threads: int = 1
+    cost_cap_usd: float | None = None
 
     def __post_init__(self) -> None:
         _require(self.trials > 0, f"trials {self.trials} must be positive")
@@ -144,6 +182,15 @@ class EvalConfig:
             self.batch == 1 or self.planner.kind in ("mllm", "file"),
             f"batch {self.batch} with planner kind {self.planner.kind!r}; allowed: mllm, or file with begin and step_batch",
         )
+        chats = self.planner.kind in CHAT_KINDS
+        _require(self.backend is not None or not chats, f"planner {self.planner.name!r} needs a backend, got null")
+        _require(1 <= self.threads <= 256, f"threads {self.threads} outside [1, 256]")
+        _require(
+            self.threads == 1 or (chats and self.workers == 0),
+            f"threads {self.threads} with planner kind {self.planner.kind!r} and workers {self.workers}; "
+            f"allowed: {', '.join(CHAT_KINDS)} with workers=0",
+        )
+        _require(self.cost_cap_usd is None or self.cost_cap_usd >= 0.0, f"cost_cap_usd {self.cost_cap_usd} is negative")
         _require(self.limit is None or self.limit > 0, f"limit {self.limit} must be positive or null")
         _require(self.retries >= 0, f"retries {self.retries} must not be negative")
         _require(self.seed >= 0, f"seed {self.seed} must not be negative")

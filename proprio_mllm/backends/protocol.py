@@ -130,8 +130,10 @@ class ChatReply:
 class Backend(Protocol):
     """Answers chats. `complete` may be called by several threads at once."""
 
-    #: Model, revision and decoding settings that decide replies, in one line; part of the cache's key and of the ledger's.
-    identity: str
+    @property
+    def identity(self) -> str:
+        """Model, revision and whatever else decides replies, in one line; part of the cache's key."""
+        ...
 
     def complete(self, request: ChatRequest) -> ChatReply:
         """The reply to a request.

@@ -24,7 +24,7 @@ import numpy as np
 from data.records import EpisodeRecord, Feedback, HistoryItem, Observation, Outcome, PlanStep
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, attribute
 from proprio_mllm.evaluation.seeds import stream
-from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
+from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo, Usage
 
 __all__ = [
     "Ask",
@@ -213,7 +213,7 @@ class _Tally:
     def __init__(self) -> None:
         self.trace: list[dict[str, Any]] = []
         self.invalid = 0
-        self.calls = 0
+        self.usage = Usage()
         self.tokens = 0
         self.planner_s = 0.0
 
@@ -237,7 +237,7 @@ def _loop(
             watch(shown, reply, feedback)
         reply = yield Ask(shown, None if feedback is None else feedback.public())
         assert reply is not None
-        tally.calls += 1
+        tally.usage += reply.usage
         if not math.isfinite(reply.latency_s):
             raise ValueError(f"the reply's latency_s is {reply.latency_s}; allowed: seconds")
         tally.tokens += int(reply.tokens)  # a planner may count in NumPy
@@ -299,8 +299,12 @@ def _record(fields: EpisodeKeyFields, tally: _Tally, wall_s: float, message: str
         makespan_s=0.0,
         path_length_m=0.0,
         arm_utilisation=0.0,
-        planner_calls=tally.calls,
+        planner_calls=tally.usage.calls,
         planner_tokens=tally.tokens,
+        cached_calls=tally.usage.cached,
+        reflections=tally.usage.reflections,
+        planner_usd=None if tally.usage.usd is None else round(tally.usage.usd, 8),
+        models=tally.usage.models,
         planner_s=round(tally.planner_s, 4),
         wall_s=round(wall_s, 3),
         trace=trace,

@@ -19,7 +19,9 @@ from data.records import EpisodeRecord, FailureCategory, Outcome
 
 __all__ = ["LEDGER_VERSION", "EpisodeKey", "Ledger", "LedgerError", "key_of", "read_ledger", "scored"]
 
-LEDGER_VERSION: Final = 1
+LEDGER_VERSION: Final = 2
+#: Fields that lines of version 1 lack; the record's own defaults stand in.
+_SINCE_2: Final = frozenset(("cached_calls", "reflections", "planner_usd", "models"))
 
 #: (planner, robot, task, difficulty, trial, seed, config hash)
 EpisodeKey = tuple[str, str, str, str, int, int, str]
@@ -48,21 +50,21 @@ def to_json(record: EpisodeRecord) -> dict[str, Any]:
 
 
 def from_json(raw: Mapping[str, Any]) -> EpisodeRecord:
-    """Reads `to_json` back.
+    """Reads `to_json` back, and lines of version 1.
 
     Raises:
         LedgerError: on another version, or missing or unknown fields.
     """
     values = dict(raw)
     version = values.pop("version", None)
-    if version != LEDGER_VERSION:
-        raise LedgerError(f"ledger version {version!r} is unknown; this code reads {LEDGER_VERSION}")
-    names = {f.name for f in dataclasses.fields(EpisodeRecord)}
+    if version not in (1, LEDGER_VERSION):
+        raise LedgerError(f"ledger version {version!r} is unknown; this code reads 1 and {LEDGER_VERSION}")
+    names = {f.name for f in dataclasses.fields(EpisodeRecord)} - (_SINCE_2 if version == 1 else frozenset())
     if set(values) != names:
         raise LedgerError(f"missing fields {sorted(names - set(values))}, unknown fields {sorted(set(values) - names)}")
     values["outcome"] = Outcome(values["outcome"])
     values["failure"] = None if values["failure"] is None else FailureCategory(values["failure"])
-    values["trace"] = tuple(values["trace"])
+    values["trace"], values["models"] = tuple(values["trace"]), tuple(values.get("models", ()))
     return EpisodeRecord(**values)
 
 

@@ -92,15 +92,15 @@ def run_jobs(
 
 
 class SideBySide(Protocol[J, R_co]):
-    """Does several jobs at a time in one thread."""
+    """Does several jobs at a time in this process."""
 
-    def side_by_side(self, queue: deque[J], count: int) -> Iterator[tuple[J, R_co]]:
+    def __call__(self, queue: deque[J], count: int, /) -> Iterator[tuple[J, R_co]]:
         """Jobs with their results; the queue is emptied, and what is appended meanwhile is done too."""
         ...
 
 
 def run_side_by_side(
-    make: Callable[[], SideBySide[J, R]],
+    run: SideBySide[J, R],
     jobs: Sequence[J],
     count: int,
     failed: Callable[[R], bool],
@@ -110,7 +110,7 @@ def run_side_by_side(
     """As `run_jobs` with no worker process, with up to `count` jobs at a time.
 
     Args:
-        make: makes the worker.
+        run: does them.
         jobs: what is to be done, in the order it is started.
         count: jobs at a time.
         failed: whether a result is worth another attempt. Every attempt's result is given out.
@@ -118,7 +118,7 @@ def run_side_by_side(
         retries: further attempts per job.
     """
     queue, attempts = deque(jobs), Counter[Hashable]()
-    for job, result in make().side_by_side(queue, count):
+    for job, result in run(queue, count):
         yield result
         attempts[name(job)] += 1
         if failed(result) and attempts[name(job)] <= retries:

@@ -23,7 +23,7 @@ from typing import Any, Final
 from tqdm import tqdm
 
 import configs
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import CHAT_KINDS, EvalConfig, PlannerConfig
 from data.cluster import import_ray
 from data.files import file_hash, write_text
 from data.records import EpisodeRecord, Outcome
@@ -34,6 +34,7 @@ from proprio_mllm.evaluation.scheduling import scheduled
 from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, Opener, WorkerSetup
 from proprio_mllm.planners.file_planner import source_digest, split_source
+from proprio_mllm.planners.memory import MEMORY_FILE, check_memory
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.planners.registry import make_planner
 from sim.contingency import load_contingency
@@ -45,6 +46,10 @@ __all__ = ["RUN_VERSION", "EvalRun", "evaluate", "plan_episodes", "run_folder", 
 logger = logging.getLogger(__name__)
 
 RUN_VERSION: Final = 1
+#: What of a backend decides its replies; where it stands, what it costs and whether it is replayed do not.
+_BACKEND_DECIDES: Final = (
+    "model", "revision", "structured", "max_tokens", "temperature", "image_size", "constrained", "source",
+)  # fmt: skip
 _ROOT: Final = Path(configs.__file__).resolve().parent.parent
 
 
@@ -57,12 +62,14 @@ class EvalRun:
         metadata: contents of `run.json`.
         records: the planned episodes that are scored, in planned order.
         broken: infrastructure errors of the planned episodes, every attempt.
+        stopped: why the run could not go on; empty when it did.
     """
 
     folder: Path
     metadata: dict[str, Any]
     records: tuple[EpisodeRecord, ...]
     broken: tuple[EpisodeRecord, ...]
+    stopped: str = ""
 
 
 def found(path: str) -> Path:
@@ -111,10 +118,17 @@ def select_tasks(cfg: EvalConfig) -> tuple[Task, ...]:
 def config_hash(cfg: EvalConfig, digest: str) -> str:
     """Hash of what decides results besides the rest of the episode's key."""
     planner = dataclasses.asdict(cfg.planner)
-    for name in ("label", "train", "weights", "source"):
+    for name in ("label", "train", "weights", "source", "memory"):
         del planner[name]
+    # what a planner's kind does not know, or leaves as it has always been, is no part of its runs' names
+    defaults = {f.name: f.default for f in dataclasses.fields(PlannerConfig)}
+    for name in ("reflection", "replans", "horizon", "history", "body", "examples"):
+        if cfg.planner.kind not in CHAT_KINDS and planner[name] == defaults[name]:
+            del planner[name]
     decides = {"planner": planner, "weights": digest, "robot": dataclasses.asdict(cfg.robot), "start": cfg.start}
     decides["contingencies"] = _contingencies_hash(cfg)
+    if cfg.backend is not None and cfg.planner.kind in CHAT_KINDS:
+        decides["backend"] = {name: getattr(cfg.backend, name) for name in _BACKEND_DECIDES}
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -162,6 +176,8 @@ def run_folder(cfg: EvalConfig, digest: str) -> Path:
         parts.append(cfg.start)
     if cfg.split != "all":
         parts.append(cfg.split)
+    if cfg.planner.reflection == "off":
+        parts.append("no_reflection")
     if cfg.seed != 0:
         parts.append(f"seed{cfg.seed}")
     if cfg.tasks != "benchmark":
@@ -191,6 +207,8 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileg
         "config_hash": config_hash(cfg, digest),
         "command": "python " + " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "planned": [[job.fields.task, job.fields.category, job.fields.trial, job.fields.config_hash] for job in jobs],
+        "reflection": cfg.planner.reflection,
+        "backend": None if cfg.backend is None or cfg.planner.kind not in CHAT_KINDS else dataclasses.asdict(cfg.backend),
         "config": dataclasses.asdict(cfg),
     }
 
@@ -203,6 +221,9 @@ def _resolved(planner: PlannerConfig) -> tuple[PlannerConfig, str]:
         planner = dataclasses.replace(planner, source=source)
         make_planner(planner)  # fails here, with one message, rather than in every worker
         return planner, source_digest(source)
+    if planner.memory is not None:
+        memory = check_memory(found(planner.memory))
+        return dataclasses.replace(planner, memory=str(memory.absolute())), file_hash(memory / MEMORY_FILE)[:16]
     if planner.weights is None:
         return planner, ""
     folder = check_weights(found(planner.weights), planner.train)
@@ -217,11 +238,13 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
         opener: opens sessions; the simulator's by default.
 
     Returns:
-        All planned episodes, those of earlier runs of the same command included.
+        All planned episodes, those of earlier runs of the same command included; `stopped` tells when a cost cap or a backend
+        that cannot answer ended the run early.
 
     Raises:
         WeightsError: when the planner's weights are absent.
         PlannerFileError: when the planner cannot be made from its file.
+        MemoryFileError: when the planner's memory is absent.
         ValueError: when there is no task to run, the robot's description is wrong, `robot.mjcf` is given, or the contingency is
             unknown.
     """
@@ -247,16 +270,22 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
         missing = [job for job, key in zip(jobs, wanted, strict=True) if key not in scores]
         if len(missing) < len(jobs):
             logger.info("%d of %d episodes are already in %s", len(jobs) - len(missing), len(jobs), path)
-        setup = WorkerSetup(planner, cfg.difficulty, cfg.start, cfg.contingencies)
+        backend = cfg.backend if planner.kind in CHAT_KINDS else None
+        own = str(folder.absolute())
+        setup = WorkerSetup(planner, cfg.difficulty, cfg.start, cfg.contingencies, None, backend, own, cfg.cost_cap_usd)
+        stopped = ""
         # Long episodes first, so that the workers finish together.
         order = sorted(missing, key=lambda job: -job.task.step_budget)
         solved = sum(scores[key].outcome is Outcome.SUCCESS for key in wanted if key in scores)
         title = f"{cfg.planner.name} {cfg.robot.name} {cfg.difficulty}"
         with (
             tqdm(total=len(jobs), initial=len(jobs) - len(missing), desc=title, unit="episode") as bar,
-            contextlib.closing(scheduled(cfg, setup, order, _broke, opener)) as results,
+            contextlib.closing(scheduled(cfg, setup, order, _to_repeat, opener)) as results,
         ):
             for result in results:
+                if result.stop:
+                    stopped = result.stop
+                    break
                 ledger.append(result.record)
                 if not _broke(result):
                     solved += result.record.outcome is Outcome.SUCCESS
@@ -266,7 +295,11 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
     scores = scored(everything)
     keys = set(wanted)
     broken = [r for r in everything if r.outcome is Outcome.INFRASTRUCTURE_ERROR and key_of(r) in keys]
-    return EvalRun(folder, metadata, tuple(scores[key] for key in wanted if key in scores), tuple(broken))
+    return EvalRun(folder, metadata, tuple(scores[key] for key in wanted if key in scores), tuple(broken), stopped)
+
+
+def _to_repeat(result: EpisodeResult) -> bool:
+    return _broke(result) and not result.stop
 
 
 def _broke(result: EpisodeResult) -> bool:

@@ -26,7 +26,7 @@ def scheduled(
     failed: Callable[[EpisodeResult], bool],
     opener: Opener | None = None,
 ) -> Generator[EpisodeResult]:
-    """Results of episodes in the order they end, every attempt's; what `workers`, `scheduler` and `batch` say decides how.
+    """Results of episodes in the order they end, every attempt's; what `workers`, `scheduler`, `threads`, `batch` say decides.
 
     Args:
         cfg: the evaluation.
@@ -46,10 +46,12 @@ def scheduled(
             if cfg.batch > 1:
                 setup = dataclasses.replace(setup, server=ray_model(ray, setup.planner, cfg.batch))
             yield from run_ray_jobs(ray, make(setup), jobs, cfg.workers, failed, lost_episode, cfg.retries)
+    elif cfg.threads > 1:
+        yield from run_side_by_side(make(setup)().in_threads, jobs, cfg.threads, failed, lambda job: job.fields, cfg.retries)
     elif cfg.batch == 1:
         yield from run_jobs(make(setup), jobs, cfg.workers, failed, lost_episode, cfg.retries)
     elif cfg.workers == 0:
-        yield from run_side_by_side(make(setup), jobs, cfg.batch, failed, lambda job: job.fields, cfg.retries)
+        yield from run_side_by_side(make(setup)().side_by_side, jobs, cfg.batch, failed, lambda job: job.fields, cfg.retries)
     else:
         with model_process(setup.planner, cfg.batch) as model:
             own = make(dataclasses.replace(setup, server=model.server))

@@ -9,12 +9,16 @@ import dataclasses
 import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from configs.schema.eval import DifficultyName, PlannerConfig, StartName
+from configs.schema.backend import BackendConfig
+from configs.schema.eval import CHAT_KINDS, DifficultyName, PlannerConfig, StartName
 from configs.schema.robot import RobotConfig
 from data.records import EpisodeRecord, Outcome
+from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest, CostCapError
 from proprio_mllm.evaluation.batching import answer_all
 from proprio_mllm.evaluation.episode import (
     Ask,
@@ -26,7 +30,7 @@ from proprio_mllm.evaluation.episode import (
     run_episode,
 )
 from proprio_mllm.planners.protocol import BatchPlanner, Planner, PlannerReply
-from proprio_mllm.planners.registry import make_planner
+from proprio_mllm.planners.registry import make_chat_planner, make_planner
 from sim.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -45,6 +49,9 @@ class WorkerSetup:
         start: see `EvalConfig.start`.
         contingency: see `EvalConfig.contingencies`.
         server: gives a planner that asks a model in another process; None makes the planner here.
+        backend: the language model that a planner which chats asks.
+        folder: of the run, where its processes share what they may spend and how many calls go on at once.
+        cap_usd: most money the run may spend.
     """
 
     planner: PlannerConfig
@@ -52,6 +59,9 @@ class WorkerSetup:
     start: StartName
     contingency: str = "default"
     server: PlannerServer | None = None
+    backend: BackendConfig | None = None
+    folder: str = ""
+    cap_usd: float | None = None
 
 
 class PlannerServer(Protocol):
@@ -85,10 +95,17 @@ class EpisodeJob:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeResult:
-    """A finished episode, with the row for `rollouts` shards when it was asked for."""
+    """A finished episode.
+
+    Attributes:
+        record: its line of the ledger.
+        rollout: the row for `rollouts` shards when it was asked for.
+        stop: why the run cannot go on; the record is then of no worth.
+    """
 
     record: EpisodeRecord
     rollout: Mapping[str, Any] | None = None
+    stop: str = ""
 
 
 #: Opens a session for a job and attaches privileged planners to it.
@@ -115,7 +132,8 @@ class EpisodeWorker:
         logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
         self.setup = setup
         self._opener = opener
-        self.planner = _planner(setup)
+        self._chats = _Chats(setup) if setup.backend is not None and setup.planner.kind in CHAT_KINDS else None
+        self.planner = _planner(setup) if self._chats is None else self._chats.planner()
 
     def __call__(self, job: EpisodeJob) -> EpisodeResult:
         """Runs one episode."""
@@ -123,7 +141,51 @@ class EpisodeWorker:
         task, watch = job.task, None if recorder is None else recorder.watch
         opening = self._opening(job, opened)
         record = run_episode(opening, self.planner, job.fields, task.instruction, task.step_budget, job.luck, watch)
-        return _result(job, record, recorder, opened)
+        return self._finished(_result(job, record, recorder, opened))
+
+    def in_threads(self, queue: deque[EpisodeJob], count: int) -> Iterator[tuple[EpisodeJob, EpisodeResult]]:
+        """Runs the episodes of a queue, up to `count` at a time, each with a planner of its own that answers in a thread.
+
+        The simulator stays in this thread and works for whichever episode has its answer; a model that is slow to answer keeps
+        the others going.
+
+        Args:
+            queue: is emptied; what is appended meanwhile is run too.
+            count: episodes at a time.
+
+        Yields:
+            Each job with its result, in the order they end.
+
+        Raises:
+            ValueError: when the planner asks no backend.
+        """
+        if self._chats is None:
+            raise ValueError(f"planner {self.setup.planner.name!r} asks no backend; threads are for planners that do")
+        planners = [self._chats.planner() for _ in range(count)]
+        running: dict[int, _Running] = {}
+        asked: dict[Future[PlannerReply | Exception | None], int] = {}
+        with ThreadPoolExecutor(count) as pool:
+            while queue or running:
+                for slot in range(count):
+                    if queue and slot not in running:
+                        running[slot] = self._started(dataclasses.replace(queue.popleft(), slot=slot))
+                for slot in sorted(set(running) - set(asked.values())):
+                    one = running[slot]
+                    if one.record is None:
+                        assert one.request is not None
+                        asked[pool.submit(_answer, planners[slot], one.request)] = slot
+                for slot in [slot for slot, one in running.items() if one.record is not None]:
+                    one = running.pop(slot)
+                    assert one.record is not None
+                    yield one.job, self._finished(_result(one.job, one.record, one.recorder, one.opened))
+                if asked:
+                    for future in wait(asked, return_when=FIRST_COMPLETED).done:
+                        running[asked.pop(future)].go_on(future.result())
+
+    def _finished(self, result: EpisodeResult) -> EpisodeResult:
+        """The result, with what keeps the run from going on."""
+        stop = "" if self._chats is None else self._chats.stop
+        return dataclasses.replace(result, stop=stop) if stop and _broken(result) else result
 
     def side_by_side(self, queue: deque[EpisodeJob], count: int) -> Iterator[tuple[EpisodeJob, EpisodeResult]]:
         """Runs the episodes of a queue in this thread, up to `count` at a time, and asks the planner for all of them at once.
@@ -207,6 +269,54 @@ class _Running:
             self.go_on(error)
         else:
             self.go_on(None)
+
+
+class _Chats:
+    """Planners of one process that share a backend, and why it can answer no more."""
+
+    def __init__(self, setup: WorkerSetup) -> None:
+        from proprio_mllm.backends.making import make_backend  # clients and models load only where they are asked
+
+        assert setup.backend is not None
+        self._setup, self._cfg = setup, setup.backend
+        self._backend = make_backend(setup.backend, Path(setup.folder), setup.cap_usd)
+        self.stop = ""
+
+    def planner(self) -> Planner:
+        """Another planner."""
+        return make_chat_planner(self._setup.planner, self._cfg, self)
+
+    @property
+    def identity(self) -> str:
+        """The backend's."""
+        return self._backend.identity
+
+    def complete(self, request: ChatRequest) -> ChatReply:
+        """The backend's reply; what it says when it can answer no more is kept."""
+        try:
+            return self._backend.complete(request)
+        except (BackendSetupError, CostCapError) as error:
+            self.stop = str(error)
+            raise
+
+    def close(self) -> None:
+        """Closes the backend."""
+        self._backend.close()
+
+
+def _answer(planner: Planner, request: Begin | Ask) -> PlannerReply | Exception | None:
+    """What a planner says, or the error it meets."""
+    try:
+        if isinstance(request, Begin):
+            planner.reset(request.task, request.rng)
+            return None
+        return planner.step(request.observation, request.feedback)
+    except Exception as error:  # noqa: BLE001  # handed to the episode that it belongs to, which records it
+        return error
+
+
+def _broken(result: EpisodeResult) -> bool:
+    return result.record.outcome is Outcome.INFRASTRUCTURE_ERROR
 
 
 def _planner(setup: WorkerSetup) -> Planner:

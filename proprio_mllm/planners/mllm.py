@@ -3,12 +3,14 @@
 What sets them apart is stored with the weights (`config.json`): MPE mode, CSE switch, and whether prompts carry motion tokens.
 The reply is greedy unless a temperature is given; then tokens are drawn from the episode's generator.
 
-Paper: Proprio-MLLM as embodied planner. Left out here: the reflection prompt after failures (the feedback codes of the last
-steps are in every prompt instead).
+Paper: Proprio-MLLM as embodied planner, with reflection or without (Table III). The paper's prompt is not published. Here
+reflection is what the model was trained for: failed steps stand in the log with their codes, and the next step answers them.
+Without it they are left out of the log, so that the model sees what its steps have changed and nothing of those that failed.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,9 +24,9 @@ from proprio_mllm.model.building import load_model, load_motion
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.observing import plan_example
-from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights, parse_reply
+from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights, parse_reply, succeeded
 
-__all__ = ["MllmPlanner"]
+__all__ = ["MllmPlanner", "without_failures"]
 
 
 class MllmPlanner:
@@ -35,6 +37,7 @@ class MllmPlanner:
         motion: the motion tokenizer; needed when the model's prompts carry motion tokens.
         temperature: 0 takes the most likely token.
         max_new_tokens: longest reply.
+        reflection: whether failed steps are in the log.
 
     Raises:
         ValueError: when motion tokens are wanted and there is no tokenizer for them.
@@ -43,7 +46,12 @@ class MllmPlanner:
     privileged = False
 
     def __init__(
-        self, model: ProprioMLLM, motion: MotionTokenizer | None, temperature: float = 0.0, max_new_tokens: int = 48
+        self,
+        model: ProprioMLLM,
+        motion: MotionTokenizer | None,
+        temperature: float = 0.0,
+        max_new_tokens: int = 48,
+        reflection: bool = True,
     ) -> None:
         if model.cfg.proprioception and motion is None:
             raise ValueError(f"model {model.cfg.name!r} reads motion tokens: it has no motion tokenizer")
@@ -51,13 +59,19 @@ class MllmPlanner:
         self.motion = motion
         self.temperature = temperature
         self.max_new_tokens = max_new_tokens
+        self.reflection = reflection
         self.image_size = model.cfg.image_size
         self._collator = Collator(model.processor, model.cfg)
         self._generator = torch.Generator().manual_seed(0)
 
     @staticmethod
     def load(
-        folder: str | Path, adapter: str | None = None, temperature: float = 0.0, max_new_tokens: int = 48, train: str = ""
+        folder: str | Path,
+        adapter: str | None = None,
+        temperature: float = 0.0,
+        max_new_tokens: int = 48,
+        train: str = "",
+        reflection: bool = True,
     ) -> MllmPlanner:
         """Reads a stored model.
 
@@ -67,6 +81,7 @@ class MllmPlanner:
             temperature: see the class.
             max_new_tokens: see the class.
             train: command that makes the weights, for the message when they are absent.
+            reflection: see the class.
 
         Raises:
             WeightsError: when the folder has no model.
@@ -75,7 +90,7 @@ class MllmPlanner:
         model = load_model(path, adapter)
         if torch.cuda.is_available():
             model = model.to("cuda")
-        return MllmPlanner(model, load_motion(path), temperature, max_new_tokens)
+        return MllmPlanner(model, load_motion(path), temperature, max_new_tokens, reflection)
 
     def begin(self, task: TaskInfo, rng: np.random.Generator) -> torch.Generator:
         """The generator that draws the tokens of a new episode."""
@@ -94,10 +109,17 @@ class MllmPlanner:
     ) -> list[PlannerReply]:
         """One reply per observation; the latency is the batch's, shared equally."""
         started = time.perf_counter()
-        prompts = [plan_example(one, self.model.cfg, self.motion) for one in observations]
+        shown = observations if self.reflection else [without_failures(one) for one in observations]
+        prompts = [plan_example(one, self.model.cfg, self.motion) for one in shown]
         batch = self._collator(prompts, generation=True).to(self.model.device)
         rows = self.model.generate(batch, self.max_new_tokens, self.temperature, states)
         texts = self.model.processor.tokenizer.batch_decode(rows, skip_special_tokens=True)
         read = batch.attention_mask.sum(dim=1).tolist()
         each_s = (time.perf_counter() - started) / len(rows)
         return [parse_reply(text, int(count) + len(row), each_s) for text, row, count in zip(texts, rows, read, strict=True)]
+
+
+def without_failures(observation: Observation) -> Observation:
+    """The observation with the failed steps taken out of its log."""
+    kept = tuple(item for item in observation.history if succeeded(item))
+    return dataclasses.replace(observation, history=kept)

@@ -11,13 +11,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from data.records import ActionError, Feedback, Observation, PlanStep
+from data.records import ActionError, Feedback, HistoryItem, Observation, PlanStep
 
-__all__ = ["BatchPlanner", "Planner", "PlannerReply", "TaskInfo", "WeightsError", "check_weights", "parse_reply"]
+__all__ = [
+    "ONE_CALL",
+    "BatchPlanner",
+    "Planner",
+    "PlannerReply",
+    "TaskInfo",
+    "Usage",
+    "WeightsError",
+    "check_weights",
+    "parse_reply",
+    "succeeded",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +47,34 @@ class TaskInfo:
 
 
 @dataclass(frozen=True, slots=True)
+class Usage:
+    """What answers cost.
+
+    Attributes:
+        calls: calls of a model.
+        cached: how many of them were answered from a cache.
+        reflections: how many of them reflected on a failure.
+        usd: price; None where a call's price is not known.
+        models: exact models that answered, each once.
+    """
+
+    calls: int = 0
+    cached: int = 0
+    reflections: int = 0
+    usd: float | None = 0.0
+    models: tuple[str, ...] = ()
+
+    def __add__(self, other: Usage) -> Usage:
+        usd = None if self.usd is None or other.usd is None else self.usd + other.usd
+        models = tuple(dict.fromkeys((*self.models, *other.models)))
+        return Usage(self.calls + other.calls, self.cached + other.cached, self.reflections + other.reflections, usd, models)
+
+
+#: A call of a planner that says nothing about its calls.
+ONE_CALL: Final = Usage(calls=1)
+
+
+@dataclass(frozen=True, slots=True)
 class PlannerReply:
     """One answer.
 
@@ -45,6 +84,7 @@ class PlannerReply:
         error: why there is no step.
         tokens: tokens read and written, 0 for planners without a language model.
         latency_s: seconds the planner took.
+        usage: calls behind the answer; a step of a plan that was made earlier has none.
     """
 
     text: str
@@ -52,6 +92,7 @@ class PlannerReply:
     error: str = ""
     tokens: int = 0
     latency_s: float = 0.0
+    usage: Usage = ONE_CALL
 
 
 @runtime_checkable
@@ -115,6 +156,11 @@ def check_weights(folder: str | Path, train: str) -> Path:
     if not (path / "config.json").is_file():
         raise WeightsError(f"no weights at {path}: make them with `{train}`, or set planner.weights=FOLDER")
     return path
+
+
+def succeeded(item: HistoryItem) -> bool:
+    """Whether every action of an earlier step succeeded."""
+    return all(part.endswith(" ok") for part in item.feedback.split("; "))
 
 
 def parse_reply(text: str, tokens: int = 0, latency_s: float = 0.0) -> PlannerReply:

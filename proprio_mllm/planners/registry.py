@@ -1,24 +1,33 @@
-"""All planners that need nothing but an observation, by kind. The privileged expert is made in `proprio_mllm.evaluation`."""
+"""All planners that need nothing but an observation, by kind. The privileged expert is made in `proprio_mllm.evaluation`.
+
+`PLANNERS` stand alone, `CHAT_PLANNERS` ask a backend.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from configs.schema.backend import BackendConfig
 from configs.schema.eval import PlannerConfig
+from proprio_mllm.backends.protocol import Backend
+from proprio_mllm.planners.chat.options import ChatOptions
+from proprio_mllm.planners.chat.plain import PlainPlanner
 from proprio_mllm.planners.file_planner import load_planner
 from proprio_mllm.planners.protocol import Planner
 from proprio_mllm.planners.random_planner import RandomPlanner
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 
-__all__ = ["PLANNERS", "make_planner"]
+__all__ = ["CHAT_PLANNERS", "PLANNERS", "make_chat_planner", "make_planner"]
 
 
 def _mllm(cfg: PlannerConfig) -> Planner:
     from proprio_mllm.planners.mllm import MllmPlanner  # torch loads only where a model is used
 
     assert cfg.weights is not None
-    return MllmPlanner.load(cfg.weights, cfg.adapter, cfg.temperature, cfg.max_new_tokens, cfg.train)
+    return MllmPlanner.load(
+        cfg.weights, cfg.adapter, cfg.temperature, cfg.max_new_tokens, cfg.train, reflection=cfg.reflection == "on"
+    )
 
 
 def _random(cfg: PlannerConfig) -> Planner:
@@ -51,3 +60,19 @@ def make_planner(cfg: PlannerConfig) -> Planner:
     if cfg.kind not in PLANNERS:
         raise ValueError(f"planner kind {cfg.kind!r} is not made here; allowed: {', '.join(PLANNERS)}")
     return PLANNERS[cfg.kind](cfg)
+
+
+CHAT_PLANNERS: Final[Mapping[str, Callable[[Backend, ChatOptions], Planner]]] = {
+    "plain": PlainPlanner,
+}
+
+
+def make_chat_planner(cfg: PlannerConfig, backend_cfg: BackendConfig, backend: Backend) -> Planner:
+    """The configured planner on a backend.
+
+    Raises:
+        ValueError: on a kind that asks no backend.
+    """
+    if cfg.kind not in CHAT_PLANNERS:
+        raise ValueError(f"planner kind {cfg.kind!r} asks no backend; allowed: {', '.join(CHAT_PLANNERS)}")
+    return CHAT_PLANNERS[cfg.kind](backend, ChatOptions.of(cfg, backend_cfg))

@@ -15,15 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data.motion import FEATURES, KEY_BODY_COUNT, PELVIS_HEIGHT, PLANAR_VELOCITY, YAW_RATE
-from sim.robots.spec import KEY_BODIES, SIDES
+from data.motion import KEY_BODY_COUNT, PELVIS_HEIGHT, PLANAR_VELOCITY, YAW_RATE
+from proprio_mllm.model.geometry import KEY_BODIES
 
 __all__ = ["in_other_postures"]
 
 Array = NDArray[np.float64]
-_UPPER: Final = [KEY_BODIES.index("torso"), KEY_BODIES.index("head")]
-_ARMS: Final = [[KEY_BODIES.index(f"{side}_{part}") for part in ("shoulder", "elbow", "hand")] for side in SIDES]
-_LEGS: Final = [[KEY_BODIES.index(f"{side}_{part}") for part in ("hip", "knee", "ankle")] for side in SIDES]
+_INDEX: Final = {name: index for index, name in enumerate(KEY_BODIES)}
+_SIDES: Final = ("left", "right")
+_UPPER: Final = [_INDEX["torso"], _INDEX["head"]]
+_ARMS: Final = [[_INDEX[f"{side}_{part}"] for part in ("shoulder", "elbow", "hand")] for side in _SIDES]
+_LEGS: Final = [[_INDEX[f"{side}_{part}"] for part in ("hip", "knee", "ankle")] for side in _SIDES]
 _KNOTS: Final = 4
 #: Deviation of a turn in rad: at a shoulder, an elbow, hip and knee, and of the trunk about x, y, z.
 _SHOULDER, _ELBOW, _LEG, _TRUNK = 0.36, 0.22, 0.07, np.array([0.09, 0.15, 0.12])

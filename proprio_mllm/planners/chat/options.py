@@ -1,0 +1,55 @@
+"""Settings that all chat planners share, taken from planner and backend configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from configs.schema.backend import BackendConfig
+from configs.schema.eval import PlannerConfig
+
+__all__ = ["ChatOptions"]
+
+
+@dataclass(frozen=True, slots=True)
+class ChatOptions:
+    """See `PlannerConfig` and `BackendConfig`, whose fields these are.
+
+    Attributes:
+        image_size: side of the head view, pixels.
+        max_tokens: longest reply.
+        temperature: 0 asks for the most likely reply.
+        reflection: whether the call after a failure reflects on it.
+        replans: most re-plans, reflecting or not, of an episode.
+        horizon: steps of a reply of plain prompting that are carried out before it asks again.
+        history: steps of the log in a prompt.
+        body: whether the prompt tells proprioception in words.
+        examples: tasks taken from memory.
+        memory: folder of the memory, None for planners without one.
+    """
+
+    image_size: int = 500
+    max_tokens: int = 2048
+    temperature: float = 0.0
+    reflection: bool = True
+    replans: int = 5
+    horizon: int = 1
+    history: int = 20
+    body: bool = False
+    examples: int = 0
+    memory: str | None = None
+
+    @staticmethod
+    def of(planner: PlannerConfig, backend: BackendConfig) -> ChatOptions:
+        """From the two configurations."""
+        return ChatOptions(
+            backend.image_size,
+            backend.max_tokens,
+            backend.temperature,
+            planner.reflection == "on",
+            planner.replans,
+            planner.horizon,
+            planner.history,
+            planner.body,
+            planner.examples,
+            planner.memory,
+        )
