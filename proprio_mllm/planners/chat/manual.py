@@ -101,7 +101,7 @@ def role(robot: str) -> str:
         f"You plan the steps of a household robot, the dual-arm humanoid {facts.name.upper()}. It has a left and a right arm "
         f"of {facts.arm_joints} joints and {facts.arm_length_m:g} m each, with a {facts.hand} at the end, and a camera in its "
         f"head. By bending its legs it moves its pelvis between {low:g} and {high:g} m above the floor; its hands then reach "
-        f"from {down:.2g} to {up:.2g} m high. One arm carries {facts.arm_load_kg:g} kg, both together {facts.two_arm_load_kg:g} kg."
+        f"from {down:.2g} to {up:.2g} m up. An arm carries {facts.arm_load_kg:g} kg, both {facts.two_arm_load_kg:g} kg."
     )
 
 
