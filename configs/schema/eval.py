@@ -88,10 +88,6 @@ class PlannerConfig:
         _require((self.source is not None) == (self.kind == "file"), f"kind {self.kind!r} with source {self.source!r}")
         _require(self.temperature >= 0.0, f"temperature {self.temperature} must not be negative")
         _require(self.max_new_tokens > 0, f"max_new_tokens {self.max_new_tokens} must be positive")
-        _require(
-            self.reflection == "on" or self.kind in ("mllm", *CHAT_KINDS),
-            f"reflection {self.reflection!r} with planner kind {self.kind!r}, which has none; allowed: on",
-        )
         for name, low in (("replans", 0), ("horizon", 1), ("history", 1), ("examples", 0)):
             _require(getattr(self, name) >= low, f"{name} {getattr(self, name)} must be at least {low}")
         needs = self.kind in ("llm_planner", "rap")
@@ -141,6 +137,7 @@ class EvalConfig:
         retries: how often an episode with an infrastructure error is run again.
         output: folder of all outputs.
         experiment: assemble this instead of running episodes.
+        reflection: whether failures are reflected on; planners that can take it from here (`planner.reflection`).
         backend: the language model that planners which chat ask; others have none.
         threads: episodes that go on at a time in one process (`workers=0`), each with a planner of its own whose calls wait
             in a thread; for planners that ask a backend.
@@ -165,6 +162,7 @@ class EvalConfig:
     retries: int = 1
     output: str = "outputs"
     experiment: ExperimentConfig | None = None
+    reflection: Literal["on", "off"] = "on"
     backend: BackendConfig | None = None
     threads: int = 1
     cost_cap_usd: float | None = None
@@ -183,6 +181,10 @@ class EvalConfig:
             f"batch {self.batch} with planner kind {self.planner.kind!r}; allowed: mllm, or file with begin and step_batch",
         )
         chats = self.planner.kind in CHAT_KINDS
+        _require(
+            self.reflection == "on" or chats or self.planner.kind == "mllm",
+            f"reflection {self.reflection!r} with planner kind {self.planner.kind!r}, which has none; allowed: on",
+        )
         _require(self.backend is not None or not chats, f"planner {self.planner.name!r} needs a backend, got null")
         _require(1 <= self.threads <= 256, f"threads {self.threads} outside [1, 256]")
         _require(

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import yaml
 
 from configs.compose import CONFIG_DIR
-from configs.schema.eval import ExperimentConfig
+from configs.schema.eval import CHAT_KINDS, ExperimentConfig
 from data.files import write_text
 from proprio_mllm.report.figures import distribution_figures, failure_figure
 from proprio_mllm.report.paper import PAPER_ROWS, paper_ablation, paper_main, paper_replanning
@@ -26,48 +26,120 @@ _CATEGORIES: Final = ("essential", "optional", "single")
 _PAPER_NOTE: Final = "paper: printed in the paper, another simulator and a 7B model; not comparable in size, shown apart."
 
 
-def _label(name: str) -> str:
+_COSTS: Final = ("invalid %", "broken", "calls", "tokens", "USD", "model")
+
+
+def _planner(name: str) -> Mapping[str, Any]:
+    """A planner's configuration file; empty for one that has none."""
     path = CONFIG_DIR / "planner" / f"{name}.yaml"
-    return str(yaml.safe_load(path.read_text(encoding="utf-8"))["label"]) if path.is_file() else name
+    return yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
-def _cell(runs: Sequence[Run], planner: str, robot: str, difficulty: str, category: str) -> str:
-    run = newest(runs, planner, robot, difficulty, category)
-    row = None if run is None else run.row(category)
-    return "" if row is None else rate_cell(row)
+def _label(name: str) -> str:
+    return str(_planner(name).get("label", name))
+
+
+def _models(runs: Sequence[Run], planner: str) -> list[str | None]:
+    """Models that have answered a planner, the newest first; [None] for a planner without runs or backends."""
+    found = [run.backend.get("model", "") for run in runs if run.metadata["planner"] == planner and not run.machinery]
+    return list(dict.fromkeys(found)) or [None]
+
+
+def _title(planner: str, model: str | None) -> str:
+    """A row's name: the planner's label, and the model behind it where that is a choice or not the planner's own."""
+    label, kind = _label(planner), _planner(planner).get("kind")
+    if not model or (kind == "plain" and _own_model(planner) in (model, "")):
+        return label
+    return f"Plain prompting ({model})" if kind == "plain" else f"{label} ({model})"
+
+
+def _own_model(planner: str) -> str:
+    """The model that a planner's file names through its backend; empty for one that the user gives as a folder."""
+    named = [entry for entry in _planner(planner).get("defaults", ()) if isinstance(entry, dict)]
+    backend = next((value for entry in named for key, value in entry.items() if "/backend" in key), None)
+    if backend is None:
+        return ""
+    values = yaml.safe_load((CONFIG_DIR / "backend" / f"{backend}.yaml").read_text(encoding="utf-8"))
+    model = str(values.get("model", ""))
+    return "" if model == "???" else model
+
+
+def _costs(shown: Sequence[Run]) -> tuple[str, ...]:
+    """What the runs of a row cost, per episode, how much of it was invalid or broke, and who answered."""
+    records = [record for run in {run.folder: run for run in shown}.values() for record in run.records]
+    if not records:
+        return ("",) * len(_COSTS)
+    calls = sum(record.planner_calls for record in records)
+    invalid = sum(record.invalid_output for record in records)
+    prices = [record.planner_usd for record in records]
+    usd = "" if None in prices else f"{sum(filter(None, prices)) / len(records):.4f}"
+    broken = sum(len(run.broken) for run in {run.folder: run for run in shown}.values())
+    tokens = sum(record.planner_tokens for record in records)
+    return (
+        f"{100 * invalid / calls:.1f}" if calls else "", str(broken), f"{calls / len(records):.1f}",
+        f"{tokens / len(records):.0f}", usd, "; ".join(dict.fromkeys(run.model for run in shown if run.model)),
+    )  # fmt: skip
+
+
+def _own_row(title: str, cells: Sequence[tuple[Run | None, str]]) -> tuple[str, ...]:
+    """A row of ours from (run, category) per cell."""
+    rates = [None if run is None else run.row(category) for run, category in cells]
+    shown = [run for run, _ in cells if run is not None]
+    return (title, "ours", *("" if row is None else rate_cell(row) for row in rates), *_costs(shown))
+
+
+def _paper_row(method: str, values: Mapping[Any, float], places: Sequence[Any]) -> tuple[str, ...]:
+    """A row of the paper's figures; it names no costs."""
+    return (method, "paper", *(f"{values[place]:.2f}" if place in values else "" for place in places), *("",) * len(_COSTS))
 
 
 def main_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
-    """Success by category and robot, one row per planner, then the paper's rows."""
+    """Success by category and robot: a row per planner and model, the paper's row of that method below it."""
     places = [(category, robot) for category in _CATEGORIES for robot in cfg.robots]
-    columns = ("planner", "source", *(f"{category} {robot}" for category, robot in places))
-    difficulty = cfg.difficulties[0]
-    ours = [
-        (_label(name), "ours", *(_cell(runs, name, robot, difficulty, category) for category, robot in places))
-        for name in cfg.planners
-    ]
-    printed = [
-        (name, "paper", *(f"{values[place]:.2f}" if place in values else "" for place in places))
-        for name, values in paper_main().items()
-    ]
-    notes = ("ours: success in %, 95 % interval over tasks, successes/episodes.", _PAPER_NOTE)
-    return Table(f"Success by category ({difficulty})", columns, (*ours, *printed), notes)
+    difficulty, paper = cfg.difficulties[0], dict(paper_main())
+    body: list[tuple[str, ...]] = []
+    for name in cfg.planners:
+        for model in _models(runs, name):
+            cells = [(newest(runs, name, robot, difficulty, category, model=model), category) for category, robot in places]
+            body.append(_own_row(_title(name, model), cells))
+        method = PAPER_ROWS.get(name, (None, None, None))[0]
+        if method is not None:
+            body.append(_paper_row(method, paper.pop(method), places))
+    body += [_paper_row(method, values, places) for method, values in paper.items()]
+    columns = ("planner", "source", *(f"{category} {robot}" for category, robot in places), *_COSTS)
+    notes = (
+        "ours: success in %, 95 % interval over tasks, successes/episodes. calls, tokens, USD: means per episode; invalid: "
+        "share of calls; broken: attempts that failed for reasons outside the planner, run again and not scored.",
+        _PAPER_NOTE,
+    )
+    return Table(f"Success by category ({difficulty})", columns, tuple(body), notes)
 
 
 def replanning_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
-    """Success at each difficulty on dual-arm essential tasks."""
-    robot = cfg.robots[0]
-    ours = [
-        (_label(name), "ours", *(_cell(runs, name, robot, difficulty, "essential") for difficulty in cfg.difficulties))
-        for name in cfg.planners
-    ]
-    printed = [
-        (name, "paper", *(f"{values[d]:.2f}" if d in values else "" for d in cfg.difficulties))
-        for name, values in paper_replanning().items()
-    ]
-    columns = ("planner", "source", *cfg.difficulties)
-    notes = ("Low-level skills succeed in 100 % (easy), 50 % (medium), 20 % (hard) of the cases.", _PAPER_NOTE)
-    return Table(f"Re-planning, dual-arm essential, {robot}", columns, (*ours, *printed), notes)
+    """Success at each difficulty on dual-arm essential tasks, with reflection and without."""
+    robot, paper = cfg.robots[0], dict(paper_replanning())
+    body: list[tuple[str, ...]] = []
+    for name in cfg.planners:
+        method = PAPER_ROWS.get(name, (None, None, None))[1]
+        reflects = _planner(name).get("kind") in ("mllm", *CHAT_KINDS)
+        for reflection, suffix in (("on", ""), ("off", " without reflection"))[: 2 if reflects else 1]:
+            for model in _models(runs, name):
+                cells = [
+                    (newest(runs, name, robot, difficulty, "essential", reflection, model), "essential")
+                    for difficulty in cfg.difficulties
+                ]
+                body.append(_own_row(f"{_title(name, model)}{suffix}", cells))
+            values = paper.pop(f"{method}{suffix}", None)
+            if values is not None:
+                body.append(_paper_row(f"{method}{suffix}", values, cfg.difficulties))
+    body += [_paper_row(method, values, cfg.difficulties) for method, values in paper.items()]
+    columns = ("planner", "source", *cfg.difficulties, *_COSTS)
+    notes = (
+        "Low-level skills succeed in 100 % (easy), 50 % (medium), 20 % (hard) of the cases. Without reflection: see "
+        "docs/evaluation.md for what each planner then leaves out.",
+        _PAPER_NOTE,
+    )
+    return Table(f"Re-planning, dual-arm essential, {robot}", columns, tuple(body), notes)
 
 
 def ablation_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:

@@ -19,7 +19,14 @@ PAPER_ROWS: Final[Mapping[str, tuple[str | None, str | None, str | None]]] = {
     "proprio_no_cse": (None, None, "without CSE"),
     "proprio_no_mpe": (None, None, "without MPE"),
     "proprio_no_mpe_cse": (None, None, "without both"),
-    "base": ("Qwen2.5-VL-7B-Ins", None, "Qwen2.5-VL-Ins"),
+    "base": (None, None, "Qwen2.5-VL-Ins"),
+    "gpt4o": ("GPT-4o", None, None),
+    "gemini": ("Gemini-1.5-Pro", None, None),
+    "qwen2_5_vl": ("Qwen2.5-VL-7B-Ins", None, None),
+    "internvl2_5": ("InternVL2.5-8B", None, None),
+    "llm_planner": ("LLM-Planner", None, None),
+    "rap": ("RAP", None, None),
+    "dag_plan": ("DAG-Plan", "DAG-Plan", None),
 }
 _COLUMNS: Final = tuple((category, robot) for category in ("essential", "optional", "single") for robot in ("x1", "h1"))
 

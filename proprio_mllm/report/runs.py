@@ -21,6 +21,13 @@ def run_notes(run: Run) -> list[str]:
         notes.append(f"{missing} of {len(run.metadata['planned'])} episodes have no score; run the same command again.")
     if run.broken:
         notes.append(f"{len(run.broken)} attempts broke for reasons outside the planner; they are not scored.")
+    if run.machinery:
+        notes.append("A script answered in place of a model: this tests the machinery and is no result.")
+    if run.backend:
+        priced = [record.planner_usd for record in run.records]
+        spent = "an unknown price" if None in priced else f"{sum(filter(None, priced)):.4f} USD when they were made"
+        calls, cached = sum(r.planner_calls for r in run.records), sum(r.cached_calls for r in run.records)
+        notes.append(f"{calls} calls of {run.model or 'a model'}, {cached} of them from the cache, at {spent}.")
     if run.metadata["privileged"]:
         notes.append("Privileged: this planner looks into the simulator's state.")
     return notes
@@ -67,10 +74,27 @@ def write_report(run: Run) -> Table:
     return table
 
 
-def newest(runs: Sequence[Run], planner: str, robot: str, difficulty: str, category: str = "all") -> Run | None:
+def newest(
+    runs: Sequence[Run],
+    planner: str,
+    robot: str,
+    difficulty: str,
+    category: str = "all",
+    reflection: str = "on",
+    model: str | None = None,
+) -> Run | None:
     """The run to show in a cell: of these settings, the one with most episodes of the category, then the newest.
 
-    Runs over a part of the tasks (`limit`, `split`) or from other start poses are left out.
+    Runs over a part of the tasks (`limit`, `split`), from other start poses, or with a script in place of a model are left out.
+
+    Args:
+        runs: the newest first.
+        planner: its name.
+        robot: of the cell.
+        difficulty: of the cell.
+        category: of the cell.
+        reflection: `on` or `off`.
+        model: name of the backend's model; None takes any.
     """
     fitting = [
         run
@@ -78,7 +102,9 @@ def newest(runs: Sequence[Run], planner: str, robot: str, difficulty: str, categ
         if (run.metadata["planner"], run.metadata["robot"], run.metadata["difficulty"]) == (planner, robot, difficulty)
         and (run.metadata["tasks"], run.metadata["limit"], run.metadata["start"]) == ("benchmark", None, "fixed")
         and run.metadata["category"] in ("all", category)
-        and run.metadata.get("split", "all") == "all"
+        and (run.metadata.get("split", "all"), run.metadata.get("reflection", "on")) == ("all", reflection)
+        and not run.machinery
+        and model in (None, run.backend.get("model", ""))
     ]
     rows = [(run, run.row(category)) for run in fitting]
     sized = [(run, row.episodes) for run, row in rows if row is not None]

@@ -42,6 +42,24 @@ class Run:
         """The robot's configuration; empty for a run without one."""
         return self.metadata["config"].get("robot", {})
 
+    @property
+    def backend(self) -> Mapping[str, Any]:
+        """The backend's configuration; empty for a run without one."""
+        return self.metadata.get("backend") or {}
+
+    @property
+    def machinery(self) -> bool:
+        """Whether a script stood in for a model: a test of the machinery, which no table of results shows."""
+        return self.backend.get("kind") == "scripted"
+
+    @property
+    def model(self) -> str:
+        """What answered: the exact models as they named themselves, else the backend's revision, else the weights."""
+        named = dict.fromkeys(model for record in self.records for model in record.models)
+        asked = self.backend.get("revision") or self.backend.get("model", "")
+        digest = self.metadata["weights_digest"]
+        return ", ".join(named) or asked or (f"weights {digest[:8]}" if digest and self.metadata["weights"] else "")
+
     def contents(self) -> dict[str, str]:
         """Hash of each planned task's content, by task id."""
         return {task: own.rpartition("-")[2] for task, _, _, own in self.metadata["planned"]}

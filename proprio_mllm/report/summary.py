@@ -15,6 +15,7 @@ broke, not scored); `seconds` (sum of `wall_s` over episodes, `planner` part); a
 | `goal_conditions` | mean share of goals met |
 | `steps`, `makespan_s`, `path_length_m`, `arm_utilisation` | means per episode |
 | `calls`, `tokens`, `planner_s` | means per episode |
+| `reflections`, `usd` | means per episode; `usd` is null where a price is not known |
 | those of `metrics.Extras` | against the expert's certificates, at `easy`, and beside the expert |
 
 A figure without an episode is null.
@@ -71,6 +72,8 @@ class Row:
     calls: float
     tokens: float
     planner_s: float
+    reflections: float
+    usd: float
     extras: Extras
 
     def to_json(self) -> dict[str, Any]:
@@ -129,6 +132,8 @@ def _row(category: str, records: Sequence[EpisodeRecord], references: References
         calls=mean(lambda r: r.planner_calls),
         tokens=mean(lambda r: r.planner_tokens),
         planner_s=mean(lambda r: r.planner_s),
+        reflections=mean(lambda r: r.reflections),
+        usd=mean(lambda r: float("nan") if r.planner_usd is None else r.planner_usd),
         extras=extras_of(records, references),
     )
 

@@ -114,7 +114,7 @@ def test_jobs_are_refilled_and_retried_in_order() -> None:
                 job = queue.popleft()
                 yield job, job
 
-    results = run_side_by_side(Echo, [1, 2, 3], 2, lambda result: result == 2, lambda job: job, retries=2)
+    results = run_side_by_side(Echo().side_by_side, [1, 2, 3], 2, lambda result: result == 2, lambda job: job, retries=2)
     assert list(results) == [1, 2, 3, 2, 2]
 
 

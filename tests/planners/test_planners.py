@@ -7,15 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
-from configs.compose import CONFIG_DIR
-from configs.schema.eval import PlannerConfig
+from configs.compose import CONFIG_DIR, compose
+from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.validate import build
 from data.records import ACTIONS, Camera, Observation, PlanStep, Proprioception
 from proprio_mllm.planners.protocol import Planner, TaskInfo, WeightsError, check_weights, parse_reply
 from proprio_mllm.planners.random_planner import RandomPlanner
-from proprio_mllm.planners.registry import PLANNERS, make_planner
+from proprio_mllm.planners.registry import CHAT_PLANNERS, PLANNERS, make_planner
 
 INFO = TaskInfo("pick up the mug", "h1", 9)
 
@@ -77,10 +76,12 @@ def test_random_without_any_name_moves_only() -> None:
 def test_every_configured_planner_is_made_somewhere() -> None:
     kinds = set()
     for path in sorted((CONFIG_DIR / "planner").glob("*.yaml")):
-        cfg = build(PlannerConfig, yaml.safe_load(path.read_text()))
-        assert cfg.name == path.stem
-        kinds.add(cfg.kind)
-    assert kinds == {*PLANNERS, "expert"}
+        needs = ["backend.model=folder"] if path.stem in ("qwen2_5_vl", "internvl2_5") else []
+        cfg = build(EvalConfig, compose("eval", [f"planner={path.stem}", *needs]))
+        assert cfg.planner.name == path.stem
+        assert (cfg.backend is not None) == (cfg.planner.kind in CHAT_PLANNERS)
+        kinds.add(cfg.planner.kind)
+    assert kinds == {*PLANNERS, *CHAT_PLANNERS, "expert"}
 
 
 def test_registry() -> None:
