@@ -116,18 +116,21 @@ def draw_use(lines: Sequence[tuple[str, NDArray[np.int64]]]) -> Figure:
 
 
 def chosen_pairs(
-    tokenizer: MotionTokenizer, clips: Clips, count: int = 3
+    tokenizer: MotionTokenizer, clips: Clips, count: int = 4
 ) -> list[tuple[str, NDArray[np.float32], NDArray[np.float32]]]:
-    """Title, key bodies and reconstruction of some held-out clips."""
+    """Title, key bodies and reconstruction of some held-out clips, the robots in turn."""
     rng = np.random.default_rng(0)
+    robots = clips.reader.column("robot")
+    drawn = list(map(int, rng.permutation(clips.split.test)))
+    places = {index: sum(robots[one] == robots[index] for one in drawn[:place]) for place, index in enumerate(drawn)}
     pairs = []
-    for index in map(int, rng.permutation(clips.split.test)[:count]):
+    for index in sorted(drawn, key=lambda index: (places[index], robots[index]))[:count]:
         window = clips.window(index, tokenizer.cfg.window, rng)
-        pairs.append((f"{clips.reader[index]['robot']}: {clips.captions[index][0]}", *reconstruct(tokenizer, window)))
+        pairs.append((f"{robots[index]}: {clips.captions[index][0]}", *reconstruct(tokenizer, window)))
     return pairs
 
 
-def render(tokenizer: MotionTokenizer, clips: Clips, folder: Path, count: int = 3) -> list[Path]:
+def render(tokenizer: MotionTokenizer, clips: Clips, folder: Path, count: int = 4) -> list[Path]:
     """Writes `reconstruction.png`, `reconstruction_0.mp4` … and `codes.png`.
 
     Args:
