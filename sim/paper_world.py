@@ -334,6 +334,9 @@ class _PaperWorld:
                 "openable": name in self._open,
                 "isOpen": self._open.get(name, False),
                 "isToggled": self._on.get(name, False),
+                "pickupable": name in self._parents and name not in self._two_handed,
+                "moveable": name in self._two_handed,
+                "receptacle": name in self._scene.targets,
             }
         return Facts(entries, dict(self._held), self._lifted, self._two_handed, self._homes)
 

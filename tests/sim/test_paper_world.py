@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import pytest
 
 from configs.schema.collect import CollectConfig
 from data.records import PlanStep
+from sim.catalogue import load_catalogue
 from sim.collect import rows_of_part
-from sim.paper_world import Exercise, play
+from sim.paper_world import Exercise, corrections_of_part, play
 
+#: Types that a hand picks up.
+SMALL = {kind.name for kind in load_catalogue().types.values() if kind.pickupable}
 CONFIG = CollectConfig("exercises", "unused", 300, part_size=300)
 
 
@@ -71,3 +76,22 @@ def test_what_is_held_already_is_not_picked_again(episodes: list[Exercise]) -> N
         if row["history"] and row["history"][-1]["feedback"].endswith("AlreadyHeld"):
             asked = re.findall(r"Pick\(\w+, (\w+)\)", row["history"][-1]["step"])
             assert not any(f", {name})" in row["target"] and row["target"].startswith("Pick") for name in asked)
+
+
+def test_what_a_student_picks_up_for_nothing_is_put_back() -> None:
+    def student(moments: Sequence[Mapping[str, Any]]) -> list[PlanStep | None]:
+        steps: list[PlanStep | None] = []
+        for moment in moments:
+            spare = [name for name in moment["known"] if name not in moment["named"] and name.rsplit("_", 1)[0] in SMALL]
+            verbs = ("GoTo({})", "Pick(left, {})", "Pick(right, {})")
+            steps.append(PlanStep.parse(verbs[moment["step"] % 3].format(spare[0])) if spare else None)
+        return steps
+
+    config = dataclasses.replace(CONFIG, count=60, part_size=60, noise=0.0)
+    rows = list(corrections_of_part(config, 0, student))
+    back = 0
+    for row in rows:
+        last = row["history"][-1]["feedback"] if row["history"] else ""
+        picked = re.match(r"Pick\(\w+, (\w+)\) ok", last)
+        back += picked is not None and picked[1] not in row["named"] and row["target"].startswith(("Place", "GoTo"))
+    assert back > 5
