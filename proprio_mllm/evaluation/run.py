@@ -25,6 +25,7 @@ from tqdm import tqdm
 import configs
 from configs.schema.eval import EvalConfig, PlannerConfig
 from data.cluster import import_ray
+from data.code_files import source_digest, split_source
 from data.files import file_hash, write_text
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.batching import batch_planner
@@ -33,7 +34,6 @@ from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledg
 from proprio_mllm.evaluation.scheduling import scheduled
 from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, Opener, WorkerSetup
-from proprio_mllm.planners.file_planner import source_digest, split_source
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.planners.registry import make_planner
 from sim.contingency import load_contingency
@@ -198,7 +198,7 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileg
 def _resolved(planner: PlannerConfig) -> tuple[PlannerConfig, str]:
     """The planner with its weights or its file found, and their digest."""
     if planner.source is not None:
-        file, name = split_source(planner.source)
+        file, name = split_source(planner.source, "planner.source", "class")
         source = f"{found(str(file)).absolute()}:{name}"
         planner = dataclasses.replace(planner, source=source)
         make_planner(planner)  # fails here, with one message, rather than in every worker
@@ -221,7 +221,7 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
 
     Raises:
         WeightsError: when the planner's weights are absent.
-        PlannerFileError: when the planner cannot be made from its file.
+        CodeFileError: when the planner cannot be made from its file.
         ValueError: when there is no task to run, the robot's description is wrong, `robot.mjcf` is given, or the contingency is
             unknown.
     """
