@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ __all__ = ["Database", "Tables"]
 
 #: How long a write waits for those of others.
 _BUSY_S: Final = 30.0
+_POLL_S: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +101,7 @@ class Database:
                     connection.execute(f"PRAGMA application_id = {self._tables.application}")
                     connection.execute(f"PRAGMA user_version = {self._tables.version}")
                 self._check(connection)
-            connection.execute("PRAGMA journal_mode = WAL")
-            connection.execute("PRAGMA synchronous = FULL")
+            _log_ahead(connection)
         except BaseException:
             connection.close()
             raise
@@ -155,6 +156,20 @@ class Database:
 def _connection(address: str) -> sqlite3.Connection:
     uri = address.startswith("file:")
     return sqlite3.connect(address, timeout=_BUSY_S, isolation_level=None, check_same_thread=False, uri=uri)
+
+
+def _log_ahead(connection: sqlite3.Connection) -> None:
+    """Switches the log on; SQLite does not wait by itself for others that do the same."""
+    deadline = time.monotonic() + _BUSY_S
+    while True:
+        try:
+            connection.execute("PRAGMA journal_mode = WAL")
+            break
+        except sqlite3.OperationalError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(_POLL_S)
+    connection.execute("PRAGMA synchronous = FULL")
 
 
 @contextlib.contextmanager

@@ -9,16 +9,14 @@ Paper: none (engineering).
 
 from __future__ import annotations
 
-import ipaddress
 import time
 from collections.abc import Iterator
 from typing import Final
-from urllib.parse import urlsplit
 
 import httpx2
 import openai
 
-__all__ = ["MAX_REPLY_BYTES", "ReplyTooLongError", "bounded_client", "on_this_machine"]
+__all__ = ["MAX_REPLY_BYTES", "ReplyTooLongError", "bounded_client"]
 
 #: Longest body that is read, bytes; a chat completion of 2,048 tokens has about 10 kB.
 MAX_REPLY_BYTES: Final = 16 * 2**20
@@ -87,12 +85,3 @@ def bounded_client(timeout_s: float, own_machine: bool, limit_bytes: int = MAX_R
         follow_redirects=False,
         trust_env=not own_machine,
     )
-
-
-def on_this_machine(url: str) -> bool:
-    """Whether a URL's host is loopback."""
-    host = urlsplit(url).hostname or ""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

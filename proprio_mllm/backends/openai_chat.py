@@ -15,17 +15,16 @@ import logging
 import time
 from typing import Any, Final
 
-import httpx2
 import openai
 
 from configs.schema.backend import BackendConfig
+from proprio_mllm.backends.address import checked_url, on_this_machine
 from proprio_mllm.backends.api_failures import failure_of, is_refusal
 from proprio_mllm.backends.chat_completion import read_completion
-from proprio_mllm.backends.http_client import MAX_REPLY_BYTES, bounded_client, on_this_machine
+from proprio_mllm.backends.http_client import MAX_REPLY_BYTES, bounded_client
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import (
     BackendError,
-    BackendSetupError,
     ChatImage,
     ChatMessage,
     ChatReply,
@@ -57,7 +56,7 @@ class OpenAIChat:
     """
 
     def __init__(self, cfg: BackendConfig, limit_bytes: int = MAX_REPLY_BYTES) -> None:
-        url = _checked_url(cfg)
+        url = checked_url(cfg.base_url or OPENAI_URL, cfg.name)
         own_machine = on_this_machine(url)
         self.identity = identity_of(cfg)
         self._cfg = cfg
@@ -136,19 +135,6 @@ class OpenAIChat:
     def __reduce__(self) -> tuple[type[OpenAIChat], tuple[BackendConfig, int]]:
         """Its configuration: whoever it is sent to reads the key from an environment of its own."""
         return OpenAIChat, (self._cfg, self._limit_bytes)
-
-
-def _checked_url(cfg: BackendConfig) -> str:
-    url = cfg.base_url or OPENAI_URL
-    if "@" in url or "?" in url:
-        raise BackendSetupError(f"backend {cfg.name}: base_url holds a user or a query; a key belongs in {cfg.key_env}")
-    try:
-        parsed = httpx2.URL(url)
-    except httpx2.InvalidURL:
-        parsed = httpx2.URL()
-    if parsed.scheme not in ("http", "https") or not parsed.host:
-        raise BackendSetupError(f"backend {cfg.name}: base_url {url!r} is not allowed; allowed: http(s)://HOST[:PORT]/PATH")
-    return url
 
 
 def _shortened(text: str) -> str:
