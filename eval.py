@@ -29,7 +29,7 @@ def main(overrides: Sequence[str]) -> int:
         overrides: `key=value` pairs of `configs/eval.yaml`.
 
     Returns:
-        0; 1 when episodes stay without a score, weights are absent or a table cannot be assembled; 2 on a wrong key, value or
+        0; 1 when episodes stay without a score, weights or a backend are absent or a table cannot be assembled; 2 on a wrong key, value or
         ledger.
     """
     if asks_for_help(overrides):
@@ -42,6 +42,7 @@ def main(overrides: Sequence[str]) -> int:
     except ConfigError as error:
         console.print(f"eval.py: {error}", style="red", markup=False, soft_wrap=True)
         return 2
+    from proprio_mllm.backends.protocol import BackendError
     from proprio_mllm.evaluation.run import evaluate  # loads the simulator; a typo above stops before that
     from proprio_mllm.planners.protocol import WeightsError
     from proprio_mllm.report.experiments import assemble
@@ -59,9 +60,9 @@ def main(overrides: Sequence[str]) -> int:
         return 0
     try:
         done = evaluate(cfg)
-    except (WeightsError, ValueError) as error:
+    except (WeightsError, BackendError, ValueError) as error:
         console.print(f"eval.py: {error}", style="red", markup=False, soft_wrap=True)
-        return 1 if isinstance(error, WeightsError) else 2
+        return 1 if isinstance(error, (WeightsError, BackendError)) else 2
     folder = done.folder
     run = load_run(folder)
     table = write_report(run)

@@ -192,6 +192,11 @@ class EvalConfig:
             f"threads {self.threads} with planner kind {self.planner.kind!r} and workers {self.workers}; "
             f"allowed: {', '.join(CHAT_KINDS)} with workers=0",
         )
+        local = chats and self.backend is not None and self.backend.kind == "local"
+        _require(
+            self.workers == 0 or not local,
+            f"workers {self.workers} with a backend in this process; allowed: workers=0, with threads=N for N episodes at a time",
+        )
         _require(self.cost_cap_usd is None or self.cost_cap_usd >= 0.0, f"cost_cap_usd {self.cost_cap_usd} is negative")
         _require(self.limit is None or self.limit > 0, f"limit {self.limit} must be positive or null")
         _require(self.retries >= 0, f"retries {self.retries} must not be negative")

@@ -26,6 +26,7 @@ __all__ = [
     "ChatRequest",
     "CostCapError",
     "FinishReason",
+    "LostReplyError",
 ]
 
 #: How a reply ended: by itself, cut off at `max_tokens`, or refused by the model or its filter.
@@ -38,6 +39,10 @@ class BackendError(RuntimeError):
 
 class BackendSetupError(BackendError):
     """A call that no repetition mends: no key, a wrong one, an unknown model or URL."""
+
+
+class LostReplyError(BackendError):
+    """A call that was sent and whose reply did not come whole, or made no sense: it may have been charged."""
 
 
 class CostCapError(BackendError):

@@ -25,15 +25,17 @@ from tqdm import tqdm
 import configs
 from configs.schema.eval import CHAT_KINDS, EvalConfig, PlannerConfig
 from data.cluster import import_ray
+from data.code_files import source_digest, split_source
 from data.files import file_hash, write_text
 from data.records import EpisodeRecord, Outcome
+from proprio_mllm.backends.identity import identity_of
+from proprio_mllm.backends.making import make_backend
 from proprio_mllm.evaluation.batching import batch_planner
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
 from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledger, scored
 from proprio_mllm.evaluation.scheduling import scheduled
 from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, Opener, WorkerSetup
-from proprio_mllm.planners.file_planner import source_digest, split_source
 from proprio_mllm.planners.memory import MEMORY_FILE, check_memory
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.planners.registry import make_planner
@@ -46,10 +48,6 @@ __all__ = ["RUN_VERSION", "EvalRun", "evaluate", "plan_episodes", "run_folder", 
 logger = logging.getLogger(__name__)
 
 RUN_VERSION: Final = 1
-#: What of a backend decides its replies; where it stands, what it costs and whether it is replayed do not.
-_BACKEND_DECIDES: Final = (
-    "model", "revision", "structured", "max_tokens", "temperature", "image_size", "constrained", "source",
-)  # fmt: skip
 _ROOT: Final = Path(configs.__file__).resolve().parent.parent
 
 
@@ -128,7 +126,8 @@ def config_hash(cfg: EvalConfig, digest: str) -> str:
     decides = {"planner": planner, "weights": digest, "robot": dataclasses.asdict(cfg.robot), "start": cfg.start}
     decides["contingencies"] = _contingencies_hash(cfg)
     if cfg.backend is not None and cfg.planner.kind in CHAT_KINDS:
-        decides["backend"] = {name: getattr(cfg.backend, name) for name in _BACKEND_DECIDES}
+        own = {name: getattr(cfg.backend, name) for name in ("max_tokens", "temperature", "image_size")}
+        decides["backend"] = own | {"identity": identity_of(cfg.backend)}
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -208,7 +207,7 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileg
         "command": "python " + " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "planned": [[job.fields.task, job.fields.category, job.fields.trial, job.fields.config_hash] for job in jobs],
         "reflection": cfg.planner.reflection,
-        "backend": None if cfg.backend is None or cfg.planner.kind not in CHAT_KINDS else dataclasses.asdict(cfg.backend),
+        "backend": None if cfg.backend is None else dataclasses.asdict(cfg.backend),
         "config": dataclasses.asdict(cfg),
     }
 
@@ -216,7 +215,7 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileg
 def _resolved(planner: PlannerConfig) -> tuple[PlannerConfig, str]:
     """The planner with its weights or its file found, and their digest."""
     if planner.source is not None:
-        file, name = split_source(planner.source)
+        file, name = split_source(planner.source, "planner.source", "class")
         source = f"{found(str(file)).absolute()}:{name}"
         planner = dataclasses.replace(planner, source=source)
         make_planner(planner)  # fails here, with one message, rather than in every worker
@@ -228,6 +227,19 @@ def _resolved(planner: PlannerConfig) -> tuple[PlannerConfig, str]:
         return planner, ""
     folder = check_weights(found(planner.weights), planner.train)
     return dataclasses.replace(planner, weights=str(folder.absolute())), weights_digest(folder)
+
+
+def _ready(cfg: EvalConfig) -> EvalConfig:
+    """The configuration with the backend that its planner asks, known to be there, and no other."""
+    backend = cfg.backend
+    if backend is None or cfg.planner.kind not in CHAT_KINDS:
+        return dataclasses.replace(cfg, backend=None)
+    if backend.source is not None:
+        file, name = split_source(backend.source, "backend.source", "function")
+        backend = dataclasses.replace(backend, source=f"{found(str(file)).absolute()}:{name}")
+    if backend.kind != "local":  # whose model is loaded once, where it answers
+        make_backend(backend, None).close()
+    return dataclasses.replace(cfg, backend=backend)
 
 
 def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
@@ -243,8 +255,9 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
 
     Raises:
         WeightsError: when the planner's weights are absent.
-        PlannerFileError: when the planner cannot be made from its file.
         MemoryFileError: when the planner's memory is absent.
+        BackendError: when the backend cannot be made.
+        CodeFileError: when the planner cannot be made from its file.
         ValueError: when there is no task to run, the robot's description is wrong, `robot.mjcf` is given, or the contingency is
             unknown.
     """
@@ -253,6 +266,7 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
             f"robot.mjcf={cfg.robot.mjcf!r}: episodes take another MJCF through a description, robot.spec=FILE.yaml"
         )
     load_robot(cfg.robot.spec or cfg.robot.name)  # a wrong description stops here, not in every episode
+    cfg = _ready(cfg)
     planner, digest = _resolved(cfg.planner)
     if cfg.scheduler == "ray":
         import_ray(cfg.ray_address)  # a missing extra stops here, before anything is written
@@ -270,9 +284,8 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
         missing = [job for job, key in zip(jobs, wanted, strict=True) if key not in scores]
         if len(missing) < len(jobs):
             logger.info("%d of %d episodes are already in %s", len(jobs) - len(missing), len(jobs), path)
-        backend = cfg.backend if planner.kind in CHAT_KINDS else None
         own = str(folder.absolute())
-        setup = WorkerSetup(planner, cfg.difficulty, cfg.start, cfg.contingencies, None, backend, own, cfg.cost_cap_usd)
+        setup = WorkerSetup(planner, cfg.difficulty, cfg.start, cfg.contingencies, None, cfg.backend, own, cfg.cost_cap_usd)
         stopped = ""
         # Long episodes first, so that the workers finish together.
         order = sorted(missing, key=lambda job: -job.task.step_budget)

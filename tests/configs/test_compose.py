@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import yaml
 
 from configs.compose import CONFIG_DIR, compose, groups
+from configs.schema.backend import BackendConfig
 from configs.schema.eval import EvalConfig
 from configs.schema.train import TrainConfig
 from configs.validate import ConfigError, build
@@ -25,8 +27,8 @@ ALL = sorted(path.relative_to(CONFIG_DIR) for path in CONFIG_DIR.rglob("*.yaml")
 
 
 def test_count() -> None:
-    assert len(ALL) == 29, f"configs/ holds {len(ALL)} YAML files: {[str(path) for path in ALL]}"
-    assert set(groups()) == {*GROUP_ROOT, "contingency"}
+    assert len(ALL) == 36, f"configs/ holds {len(ALL)} YAML files: {[str(path) for path in ALL]}"
+    assert set(groups()) == {*GROUP_ROOT, "contingency", "backend"}
 
 
 @pytest.mark.parametrize("path", ALL, ids=str)
@@ -37,6 +39,10 @@ def test_every_yaml_composes(path: Path) -> None:
     group, name = path.parent.name, path.stem
     if group == "contingency":
         load_contingency(name)
+        return
+    if group == "backend":
+        values = yaml.safe_load((CONFIG_DIR / path).read_text(encoding="utf-8"))
+        build(BackendConfig, {key: "answers.py:answer" if value == "???" else value for key, value in values.items()})
         return
     root = GROUP_ROOT[group]
     build(ROOTS[root], compose(root, [f"{group}={name}", *NEEDS.get(name, ())]))

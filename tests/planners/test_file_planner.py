@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data.code_files import CodeFileError, source_digest
 from data.records import Camera, Observation, Proprioception
-from proprio_mllm.planners.file_planner import PlannerFileError, load_planner, source_digest
+from proprio_mllm.planners.file_planner import load_planner
 from proprio_mllm.planners.protocol import TaskInfo
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_planner.py"
@@ -69,16 +70,16 @@ def test_the_digest_sees_the_file_its_class_and_its_neighbours(tmp_path: Path) -
 )
 def test_what_is_wrong_is_said(tmp_path: Path, text: str, name: str, message: str) -> None:
     (tmp_path / "own.py").write_text(text)
-    with pytest.raises(PlannerFileError, match=message):
+    with pytest.raises(CodeFileError, match=message):
         load_planner(f"{tmp_path / 'own.py'}:{name}")
 
 
 @pytest.mark.parametrize("source", ["own.py", "own:Good", "own.py:", "own.py:a b", ":"])
 def test_a_source_of_another_form(source: str) -> None:
-    with pytest.raises(PlannerFileError, match=r"allowed: FILE\.py:CLASS"):
+    with pytest.raises(CodeFileError, match=r"allowed: FILE\.py:CLASS"):
         load_planner(source)
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(PlannerFileError, match=r"there is no file .*gone\.py"):
+    with pytest.raises(CodeFileError, match=r"there is no file .*gone\.py"):
         load_planner(f"{tmp_path / 'gone.py'}:Good")

@@ -1,0 +1,147 @@
+"""Backends that answer from recorded replies: one that asks another when there is none, and one that asks nobody.
+
+    python -m proprio_mllm.backends.cache FILE [show=KEY] [export=FILE.jsonl] [import=FILE.jsonl]
+
+lists what a file holds, prints one call, writes all as JSON lines, or takes such lines in. Errors and replies that were cut off
+are never recorded. Paper: none (engineering).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from proprio_mllm.backends.protocol import Backend, BackendError, ChatReply, ChatRequest
+from proprio_mllm.backends.replies import ReplyStore, question_of
+from proprio_mllm.backends.transcripts import main
+
+__all__ = ["CachedBackend", "ReplayBackend"]
+
+_SHOWN_CHARACTERS: Final = 80
+
+logger = logging.getLogger(__name__)
+
+
+class CachedBackend:
+    """Answers what was answered before, and asks `inner` the rest.
+
+    Threads that ask the same thing at once ask `inner` once; of several processes each may ask, and the first reply stands for
+    all.
+
+    Args:
+        inner: what is asked; closed with this one.
+        path: file of replies.
+
+    Raises:
+        BackendSetupError: when the file cannot be used.
+    """
+
+    def __init__(self, inner: Backend, path: Path) -> None:
+        self.identity = inner.identity
+        self._inner = inner
+        self._store = ReplyStore(path)
+        self._turns = _Turns()
+
+    def complete(self, request: ChatRequest) -> ChatReply:
+        """The recorded reply, or a new one.
+
+        Raises:
+            BackendError: as of `inner`, and when the file cannot be read.
+        """
+        key, question = question_of(self.identity, request)
+        found = self._store.get(key)
+        if found is not None:
+            return found
+        with self._turns.at(key):
+            found = self._store.get(key)
+            if found is not None:
+                return found
+            reply = self._inner.complete(request)
+            return reply if reply.finish_reason == "length" else self._kept(key, question, request.purpose, reply)
+
+    def close(self) -> None:
+        """Closes the file and the backend that is asked."""
+        self._store.close()
+        self._inner.close()
+
+    def _kept(self, key: str, question: str, purpose: str, reply: ChatReply) -> ChatReply:
+        """The reply that is recorded now: this one, or another process's that came first, at this one's cost."""
+        try:
+            first = None if self._store.put(key, question, purpose, reply) else self._store.get(key)
+        except BackendError as error:  # the reply is here and may be paid for
+            logger.error("a reply is not recorded: %s", error)
+            return reply
+        if first is None:
+            return reply
+        return dataclasses.replace(reply, text=first.text, finish_reason=first.finish_reason, model=first.model)
+
+
+class ReplayBackend:
+    """Answers from recorded replies alone.
+
+    Args:
+        identity: of the backend whose replies they are.
+        path: file of replies.
+
+    Raises:
+        BackendSetupError: when there is no such file, or it cannot be used.
+    """
+
+    def __init__(self, identity: str, path: Path) -> None:
+        self.identity = identity
+        self._store = ReplyStore(path, read_only=True)
+
+    def complete(self, request: ChatRequest) -> ChatReply:
+        """The recorded reply.
+
+        Raises:
+            BackendError: when there is none; the message names the request.
+        """
+        key, _ = question_of(self.identity, request)
+        found = self._store.get(key)
+        if found is None:
+            asked = next((message.text for message in reversed(request.messages) if message.role == "user"), "")
+            start = " ".join(asked.split())[:_SHOWN_CHARACTERS]
+            raise BackendError(
+                f"{self._store.path} holds no reply to the {request.purpose!r} request {key[:12]} that begins {start!r}"
+                f" (of its backend, {self.identity}, it holds {self._store.count(self.identity)})"
+            )
+        return found
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._store.close()
+
+
+class _Turns:
+    """One thread at a time per key."""
+
+    def __init__(self) -> None:
+        self._guard = threading.Lock()
+        self._waiting: dict[str, tuple[threading.Lock, int]] = {}
+
+    @contextlib.contextmanager
+    def at(self, key: str) -> Iterator[None]:
+        with self._guard:
+            lock, waiting = self._waiting.get(key, (threading.Lock(), 0))
+            self._waiting[key] = lock, waiting + 1
+        try:
+            with lock:
+                yield
+        finally:
+            with self._guard:
+                waiting = self._waiting[key][1] - 1
+                if waiting:
+                    self._waiting[key] = lock, waiting
+                else:
+                    del self._waiting[key]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,101 @@
+"""What a server's chat completion says, read from its bytes.
+
+Only what is needed is looked at, so that servers which leave out or add fields can be used; what is needed is checked. Usage
+that is absent or makes no sense counts as unknown, 0 tokens. Tokens of hidden thoughts are charged as written ones; of servers
+that count them in the total alone (Gemini) the total is read.
+
+Format: OpenAI's API reference, object `chat.completion`. Paper: none (engineering).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from pydantic import BaseModel, Field, ValidationError
+
+from proprio_mllm.backends.protocol import ChatReply, FinishReason, LostReplyError
+
+__all__ = ["read_completion", "read_usage"]
+
+_FINISHED: Final[Mapping[str, FinishReason]] = {
+    "length": "length",
+    "max_tokens": "length",
+    "content_filter": "refusal",
+    "refusal": "refusal",
+    "safety": "refusal",
+    "recitation": "refusal",
+    "prohibited_content": "refusal",
+}
+#: Ends of replies that are neither whole nor cut at their limit.
+_BROKEN: Final = frozenset({"error", "abort"})
+
+
+class _Message(BaseModel):
+    content: str | None = None
+    refusal: str | None = None
+
+
+class _Choice(BaseModel):
+    message: _Message
+    finish_reason: str | None = None
+
+
+class _Completion(BaseModel):
+    choices: list[_Choice] = Field(min_length=1)
+    model: str | None = None
+    system_fingerprint: str | None = None
+    usage: Any = None
+
+
+def read_completion(body: bytes, content_type: str | None) -> ChatReply:
+    """A reply without its latency and cost.
+
+    Args:
+        body: of a response with status 200.
+        content_type: of its header.
+
+    Raises:
+        LostReplyError: when it is no chat completion; the message names why and holds what the server sent.
+    """
+    kind = (content_type or "application/json").partition(";")[0].strip().lower()
+    if kind != "application/json" and not kind.endswith("+json"):
+        raise LostReplyError(f"the reply is {kind!r}, not JSON: {_text(body)}")
+    try:
+        completion = _Completion.model_validate_json(body)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise LostReplyError(
+            f"the reply is no chat completion: {where + ': ' if where else ''}{first['msg']}: {_text(body)}"
+        ) from None
+    choice = completion.choices[0]
+    finished = (choice.finish_reason or "stop").lower()
+    if finished in _BROKEN:
+        raise LostReplyError(f"the reply broke off with finish_reason {finished!r}")
+    prompt_tokens, completion_tokens = read_usage(completion.usage)
+    return ChatReply(
+        text=choice.message.content or choice.message.refusal or "",
+        prompt_tokens=prompt_tokens,
+        completion_tokens=completion_tokens,
+        finish_reason="refusal" if choice.message.refusal else _FINISHED.get(finished, "stop"),
+        model=" ".join(name for name in (completion.model, completion.system_fingerprint) if name),
+    )
+
+
+def read_usage(usage: object) -> tuple[int, int]:
+    """Tokens read and written; (0, 0) when they are not known."""
+    if not isinstance(usage, Mapping):
+        return 0, 0
+    prompt, written = usage.get("prompt_tokens"), usage.get("completion_tokens", 0)
+    total = usage.get("total_tokens", 0)
+    counts = [
+        count for count in (prompt, written, total) if isinstance(count, int) and not isinstance(count, bool) and count >= 0
+    ]
+    if len(counts) < 3:
+        return 0, 0
+    return counts[0], max(counts[1], counts[2] - counts[0])
+
+
+def _text(body: bytes) -> str:
+    return " ".join(body.decode(errors="replace").split())

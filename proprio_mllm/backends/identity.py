@@ -1,0 +1,37 @@
+"""What decides a backend's replies, in one line.
+
+URL, key and kind do not: the same model behind another server, or its recorded replies, is the same backend. Paper: none
+(engineering).
+"""
+
+from __future__ import annotations
+
+import json
+
+from configs.schema.backend import BackendConfig
+from data.code_files import source_digest
+
+__all__ = ["identity_of"]
+
+
+def identity_of(cfg: BackendConfig) -> str:
+    """Canonical JSON of model, revision and what is fixed in the configuration; the rest is in every request.
+
+    Of a scripted backend it is the digest of its file, which has to be loaded. A local checkpoint is known by its folder's path
+    and `revision` alone: one that is trained anew in its folder needs a new `revision`.
+    """
+    if cfg.source is not None:
+        return _canonical({"script": source_digest(cfg.source)})
+    return _canonical(
+        {
+            "model": cfg.model,
+            "revision": cfg.revision,
+            "structured": cfg.structured,
+            "dtype": cfg.dtype,
+            "constrained": cfg.constrained,
+        }
+    )
+
+
+def _canonical(values: dict[str, object]) -> str:
+    return json.dumps(values, ensure_ascii=False, sort_keys=True, separators=(",", ":"))

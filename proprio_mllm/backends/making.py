@@ -1,0 +1,82 @@
+"""Makes a backend from its configuration.
+
+A call passes the cache, the slots, the bookings, the model, in this order: a recorded reply takes no slot and no money, and
+money is booked for calls that are made, not for those that wait. Paper: none (engineering).
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Final
+
+from configs.schema.backend import BackendConfig
+from proprio_mllm.backends.address import on_this_machine
+from proprio_mllm.backends.cache import CachedBackend, ReplayBackend
+from proprio_mllm.backends.identity import identity_of
+from proprio_mllm.backends.prices import price_of
+from proprio_mllm.backends.protocol import Backend
+from proprio_mllm.backends.scripted import ScriptedChat
+from proprio_mllm.backends.slots import Slots, SlottedBackend
+from proprio_mllm.backends.spending import Spending, SpendingBackend
+
+__all__ = ["SPENDING_FILE", "make_backend"]
+
+#: In a run's folder.
+SPENDING_FILE: Final = "spending.sqlite"
+_SLOTS_FOLDER: Final = "slots"
+
+logger = logging.getLogger(__name__)
+
+
+def make_backend(cfg: BackendConfig, run: Path | None, cap_usd: float | None = None) -> Backend:
+    """A backend; whoever asks for it closes it.
+
+    Args:
+        cfg: which one.
+        run: folder of the run whose threads and processes share slots and bookings; None shares with nobody and books nothing.
+        cap_usd: most that the run may spend, over all of its backends.
+
+    Raises:
+        BackendSetupError: when it cannot be made: no key, no file, no weights.
+        ValueError: when the cap cannot be held, or the price is not in the table.
+    """
+    if cfg.kind == "replay":
+        assert cfg.cache is not None
+        return ReplayBackend(identity_of(cfg), Path(cfg.cache))
+    _check_cap(cfg, run, cap_usd)
+    price = None if cfg.price is None else price_of(cfg.price)
+    if price is not None and cfg.model not in price.models:
+        logger.warning("backend %s: model %s is priced as %s", cfg.name, cfg.model, cfg.price)
+    backend = _model(cfg)
+    try:
+        if price is not None:
+            spending = None if run is None else Spending(run / SPENDING_FILE, cap_usd)
+            backend = SpendingBackend(backend, price, spending, cfg.name)
+        backend = SlottedBackend(backend, Slots(cfg.concurrency, None if run is None else run / _SLOTS_FOLDER / cfg.name))
+        return backend if cfg.cache is None else CachedBackend(backend, Path(cfg.cache))
+    except BaseException:
+        backend.close()
+        raise
+
+
+def _check_cap(cfg: BackendConfig, run: Path | None, cap_usd: float | None) -> None:
+    if cap_usd is None:
+        return
+    if run is None:
+        raise ValueError(f"cap_usd {cap_usd} cannot be held without a run's folder")
+    free = cfg.kind != "openai" or (cfg.base_url is not None and on_this_machine(cfg.base_url))
+    if cfg.price is None and not free:
+        raise ValueError(f"cap_usd {cap_usd} cannot be held: backend.price of {cfg.name} is null")
+
+
+def _model(cfg: BackendConfig) -> Backend:
+    if cfg.kind == "openai":
+        from proprio_mllm.backends.openai_chat import OpenAIChat  # the client takes half a second to import
+
+        return OpenAIChat(cfg)
+    if cfg.kind == "local":
+        from proprio_mllm.backends.local import LocalChat  # imports torch
+
+        return LocalChat(cfg)
+    return ScriptedChat(cfg)

@@ -1,0 +1,154 @@
+"""A model behind an OpenAI-compatible URL: OpenAI, Gemini's compatible endpoint, vLLM, `transformers serve`.
+
+One client for all of them, the `openai` package, with its own retries (time-outs, broken connections, 408, 409, 429, 5xx) and
+nothing stacked on them. Pictures are sent as data URLs of exactly the bytes they have, so that a digest of those bytes says
+what a model saw.
+
+Paper: baselines of Table II (GPT-4o and Gemini through their vendors' APIs).
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import logging
+import time
+from typing import Any, Final
+
+import openai
+
+from configs.schema.backend import BackendConfig
+from proprio_mllm.backends.address import checked_url, on_this_machine
+from proprio_mllm.backends.api_failures import failure_of, is_refusal
+from proprio_mllm.backends.chat_completion import read_completion
+from proprio_mllm.backends.http_client import MAX_REPLY_BYTES, bounded_client
+from proprio_mllm.backends.identity import identity_of
+from proprio_mllm.backends.protocol import (
+    BackendError,
+    ChatImage,
+    ChatMessage,
+    ChatReply,
+    ChatRequest,
+    LostReplyError,
+)
+from proprio_mllm.backends.secret import read_secret
+from proprio_mllm.backends.structured import strict_schema
+
+__all__ = ["OPENAI_URL", "OpenAIChat"]
+
+#: Given explicitly, because the client would otherwise take another one from the environment.
+OPENAI_URL: Final = "https://api.openai.com/v1"
+
+_SHOWN_CHARACTERS: Final = 400
+
+logger = logging.getLogger(__name__)
+
+
+class OpenAIChat:
+    """Asks a server; any number of threads may do so at once.
+
+    Args:
+        cfg: of kind `openai`. The key is read from its environment variable now, and goes nowhere but to the server.
+        limit_bytes: longest reply that is read.
+
+    Raises:
+        BackendSetupError: when there is no key, or no usable URL.
+    """
+
+    def __init__(self, cfg: BackendConfig, limit_bytes: int = MAX_REPLY_BYTES) -> None:
+        url = checked_url(cfg.base_url or OPENAI_URL, cfg.name)
+        own_machine = on_this_machine(url)
+        self.identity = identity_of(cfg)
+        self._cfg = cfg
+        self._limit_bytes = limit_bytes
+        self._secret = read_secret(cfg.key_env, cfg.name, optional=own_machine)
+        if url.startswith("http:") and not own_machine:
+            logger.warning("backend %s: the key in %s is sent unencrypted", cfg.name, cfg.key_env)
+        self._secret.guard()
+        http_client = bounded_client(cfg.timeout_s, own_machine, limit_bytes)
+        self._client = openai.OpenAI(
+            api_key=self._secret.reveal(),
+            base_url=url,
+            timeout=http_client.timeout,
+            max_retries=cfg.retries,
+            http_client=http_client,
+        )
+
+    def complete(self, request: ChatRequest) -> ChatReply:
+        """The model's reply.
+
+        Raises:
+            LostReplyError: when the reply did not come whole or is no chat completion.
+            BackendSetupError: when every call would fail: a wrong key, an unknown model or path, no money left.
+            BackendError: when the server does not answer after all attempts, or cannot answer this request.
+        """
+        if self._client.is_closed():
+            raise BackendError(f"backend {self._cfg.name}: closed")
+        body = self._body(request)
+        start = time.perf_counter()
+        reply = self._asked(body)
+        latency_s = time.perf_counter() - start
+        if isinstance(reply, BackendError):  # raised out here, so that no error of the client hangs on it
+            raise type(reply)(f"backend {self._cfg.name}: {_shortened(self._secret.redact(str(reply)))}")
+        if reply.prompt_tokens == 0 and reply.finish_reason != "refusal":
+            logger.warning("backend %s: a reply without usable token counts", self._cfg.name)
+        text, model = self._secret.redact(reply.text), self._secret.redact(reply.model)
+        return dataclasses.replace(reply, text=text, model=model, latency_s=latency_s)
+
+    def close(self) -> None:
+        """Closes its connections."""
+        self._client.close()
+        self._secret.release()
+
+    def _asked(self, body: dict[str, Any]) -> ChatReply | BackendError:
+        try:
+            raw = self._client.chat.completions.with_raw_response.create(**body)
+        except openai.OpenAIError as error:
+            if is_refusal(error):
+                return ChatReply("", finish_reason="refusal", model=self._cfg.model)
+            return failure_of(error, self._cfg.timeout_s, self._cfg.retries)
+        response = raw.http_response
+        try:
+            return read_completion(response.content, response.headers.get("content-type"))
+        except LostReplyError as error:
+            return error
+
+    def _body(self, request: ChatRequest) -> dict[str, Any]:
+        body: dict[str, Any] = {
+            "model": self._cfg.model,
+            "messages": [_message(message) for message in request.messages],
+            "temperature": request.temperature,
+            self._cfg.token_limit_field: request.max_tokens,
+        }
+        if request.schema is not None and self._cfg.structured != "off":
+            response_format: dict[str, Any] = {"type": self._cfg.structured}
+            if self._cfg.structured == "json_schema":
+                schema = strict_schema(request.schema)
+                response_format["json_schema"] = {"name": request.schema.__name__, "strict": True, "schema": schema}
+            body["response_format"] = response_format
+        return body
+
+    def __repr__(self) -> str:
+        """Name and identity."""
+        return f"OpenAIChat({self._cfg.name}, {self.identity})"
+
+    def __reduce__(self) -> tuple[type[OpenAIChat], tuple[BackendConfig, int]]:
+        """Its configuration: whoever it is sent to reads the key from an environment of its own."""
+        return OpenAIChat, (self._cfg, self._limit_bytes)
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
+
+
+def _message(message: ChatMessage) -> dict[str, Any]:
+    if not any(isinstance(part, ChatImage) for part in message.content):
+        return {"role": message.role, "content": message.text}  # simple servers know texts alone
+    return {"role": message.role, "content": [_part(part) for part in message.content]}
+
+
+def _part(part: str | ChatImage) -> dict[str, Any]:
+    if isinstance(part, str):
+        return {"type": "text", "text": part}
+    data = base64.b64encode(part.data).decode("ascii")
+    return {"type": "image_url", "image_url": {"url": f"data:{part.media_type};base64,{data}"}}
