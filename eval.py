@@ -29,8 +29,8 @@ def main(overrides: Sequence[str]) -> int:
         overrides: `key=value` pairs of `configs/eval.yaml`.
 
     Returns:
-        0; 1 when episodes stay without a score, weights or a backend are absent or a table cannot be assembled; 2 on a wrong key, value or
-        ledger.
+        0; 1 when episodes stay without a score, weights or a backend are absent, or a table cannot be assembled; 2 on a wrong
+        key, value or ledger.
     """
     if asks_for_help(overrides):
         sys.stdout.write(help_text("eval", EvalConfig, __doc__ or ""))

@@ -195,7 +195,7 @@ class EvalConfig:
         local = chats and self.backend is not None and self.backend.kind == "local"
         _require(
             self.workers == 0 or not local,
-            f"workers {self.workers} with a backend in this process; allowed: workers=0, with threads=N for N episodes at a time",
+            f"workers {self.workers} with a model in this process; allowed: workers=0, with threads=N for N episodes at once",
         )
         _require(self.cost_cap_usd is None or self.cost_cap_usd >= 0.0, f"cost_cap_usd {self.cost_cap_usd} is negative")
         _require(self.limit is None or self.limit > 0, f"limit {self.limit} must be positive or null")
