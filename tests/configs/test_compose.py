@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import yaml
 
 from configs.compose import CONFIG_DIR, compose, groups
-from configs.schema.backend import BackendConfig
 from configs.schema.eval import EvalConfig
 from configs.schema.train import TrainConfig
 from configs.validate import ConfigError, build
@@ -16,19 +14,31 @@ from sim.contingency import load_contingency
 
 ROOTS = {"train": TrainConfig, "eval": EvalConfig}
 #: Which root a group belongs to; `contingency` is data that the simulator reads.
-GROUP_ROOT = {"model": "train", "budget": "train", "data": "train", "planner": "eval", "robot": "eval", "experiment": "eval"}
+GROUP_ROOT = {
+    "model": "train",
+    "budget": "train",
+    "data": "train",
+    "planner": "eval",
+    "backend": "eval",
+    "robot": "eval",
+    "experiment": "eval",
+}
 #: What a user must add to a configuration that has no default for it.
 NEEDS = {
     "humanml3d": ("data.path=HumanML3D",),
     "amass": ("data.path=AMASS", "data.body_models=models"),
     "folder": ("data.path=motions",),
+    "qwen2_5_vl": ("backend.model=folder", "workers=0"),
+    "internvl2_5": ("backend.model=folder", "workers=0"),
+    "backend/vllm": ("backend.model=model",),
+    "backend/scripted": ("backend.source=answers.py:answer",),
 }
 ALL = sorted(path.relative_to(CONFIG_DIR) for path in CONFIG_DIR.rglob("*.yaml"))
 
 
 def test_count() -> None:
-    assert len(ALL) == 36, f"configs/ holds {len(ALL)} YAML files: {[str(path) for path in ALL]}"
-    assert set(groups()) == {*GROUP_ROOT, "contingency", "backend"}
+    assert len(ALL) == 43, f"configs/ holds {len(ALL)} YAML files: {[str(path) for path in ALL]}"
+    assert set(groups()) == {*GROUP_ROOT, "contingency"}
 
 
 @pytest.mark.parametrize("path", ALL, ids=str)
@@ -40,12 +50,8 @@ def test_every_yaml_composes(path: Path) -> None:
     if group == "contingency":
         load_contingency(name)
         return
-    if group == "backend":
-        values = yaml.safe_load((CONFIG_DIR / path).read_text(encoding="utf-8"))
-        build(BackendConfig, {key: "answers.py:answer" if value == "???" else value for key, value in values.items()})
-        return
     root = GROUP_ROOT[group]
-    build(ROOTS[root], compose(root, [f"{group}={name}", *NEEDS.get(name, ())]))
+    build(ROOTS[root], compose(root, [f"{group}={name}", *NEEDS.get(f"{group}/{name}", NEEDS.get(name, ()))]))
 
 
 @pytest.mark.parametrize(
@@ -55,7 +61,7 @@ def test_every_yaml_composes(path: Path) -> None:
         ("train", "model=giant", r"model='giant' is not allowed; allowed: qwen2_5_vl_7b, tiny"),
         ("train", "stagee=all", r"stagee: unknown key in 'stagee=all'; allowed: .*stage"),
         ("train", "model.mpe.mode=none", r"model\.mpe: mode|model\.mpe\.mode: 'none' is not allowed; allowed: mrope"),
-        ("eval", "planner=oracle", r"planner='oracle' is not allowed; allowed: base, expert"),
+        ("eval", "planner=oracle", r"planner='oracle' is not allowed; allowed: base, dag_plan, expert"),
         ("eval", "robot=atlas", r"robot='atlas' is not allowed; allowed: h1, x1"),
         ("eval", "trials=0", r"trials 0 must be positive"),
         ("train", "alignment.mask=1.5", r"mask 1\.5 outside \[0, 1\]"),
