@@ -36,6 +36,7 @@ class Handler(BaseHTTPRequestHandler):
     """Reads a request, keeps it, and lets the server's `answer` reply."""
 
     protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True  # or every answer waits 40 ms for an acknowledgement
     server: LoopbackServer
 
     def do_POST(self) -> None:

@@ -6,6 +6,7 @@ import dataclasses
 import logging
 import sqlite3
 import sys
+import time
 from pathlib import Path
 from types import ModuleType
 
@@ -22,7 +23,7 @@ from proprio_mllm.backends.prices import price_of
 from proprio_mllm.backends.protocol import BackendError, BackendSetupError, ChatReply, CostCapError
 from proprio_mllm.backends.slots import SlottedBackend
 from proprio_mllm.backends.spending import Spending
-from tests.backends.loopback import KEY, Answering, LoopbackServer, ask, completion, finished, started
+from tests.backends.loopback import KEY, Answering, Handler, LoopbackServer, ask, completion, finished, started
 
 FILES = sorted((CONFIG_DIR / "backend").glob("*.yaml"))
 #: What a user has to add.
@@ -167,6 +168,42 @@ def test_what_was_made_is_closed_when_the_rest_fails(gpt4o: BackendConfig, tmp_p
     with pytest.raises(BackendSetupError, match="is damaged"):
         make_backend(gpt4o, tmp_path)
     assert inner.closed
+
+
+ASKING = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from configs.schema.backend import BackendConfig
+from proprio_mllm.backends.making import make_backend
+from proprio_mllm.backends.protocol import ChatMessage, ChatRequest
+url, run, name = sys.argv[1:]
+cfg = BackendConfig("openai", "tested", model="m", base_url=url, concurrency=3, cache=f"{run}/replies.sqlite")
+backend = make_backend(cfg, Path(run))
+requests = [ChatRequest((ChatMessage("user", (f"{name} {number}",)),)) for number in range(15)]
+with ThreadPoolExecutor(6) as pool:
+    print(sum(reply.text == "ok" for reply in pool.map(backend.complete, requests)))
+backend.close()
+"""
+
+
+def test_no_more_calls_at_once_than_allowed_over_threads_and_processes(server: LoopbackServer, tmp_path: Path) -> None:
+    now, most = 0, 0
+
+    def slow(handler: Handler) -> None:
+        nonlocal now, most
+        with server.lock:
+            now += 1
+            most = max(most, now)
+        time.sleep(0.02)
+        with server.lock:
+            now -= 1
+        handler.send(200, completion("ok"))
+
+    server.answer = slow
+    assert finished(*(started(ASKING, server.url, tmp_path, name) for name in "ab")) == ["15\n", "15\n"]
+    assert len(server.asked) == 30
+    assert most == 3
 
 
 def test_scripted(tmp_path: Path) -> None:
