@@ -20,7 +20,7 @@ from proprio_mllm.backends.scripted import ScriptedChat
 from proprio_mllm.backends.slots import Slots, SlottedBackend
 from proprio_mllm.backends.spending import Spending, SpendingBackend
 
-__all__ = ["SPENDING_FILE", "make_backend"]
+__all__ = ["SPENDING_FILE", "check_cap", "make_backend"]
 
 #: In a run's folder.
 SPENDING_FILE: Final = "spending.sqlite"
@@ -44,7 +44,9 @@ def make_backend(cfg: BackendConfig, run: Path | None, cap_usd: float | None = N
     if cfg.kind == "replay":
         assert cfg.cache is not None
         return ReplayBackend(identity_of(cfg), Path(cfg.cache))
-    _check_cap(cfg, run, cap_usd)
+    if cap_usd is not None and run is None:
+        raise ValueError(f"cap_usd {cap_usd} cannot be held without a run's folder")
+    check_cap(cfg, cap_usd)
     price = None if cfg.price is None else price_of(cfg.price)
     if price is not None and cfg.model not in price.models:
         logger.warning("backend %s: model %s is priced as %s", cfg.name, cfg.model, cfg.price)
@@ -60,11 +62,14 @@ def make_backend(cfg: BackendConfig, run: Path | None, cap_usd: float | None = N
         raise
 
 
-def _check_cap(cfg: BackendConfig, run: Path | None, cap_usd: float | None) -> None:
+def check_cap(cfg: BackendConfig, cap_usd: float | None) -> None:
+    """Whether a cap can be held.
+
+    Raises:
+        ValueError: when the price of what may cost money is not known.
+    """
     if cap_usd is None:
         return
-    if run is None:
-        raise ValueError(f"cap_usd {cap_usd} cannot be held without a run's folder")
     free = cfg.kind != "openai" or (cfg.base_url is not None and on_this_machine(cfg.base_url))
     if cfg.price is None and not free:
         raise ValueError(f"cap_usd {cap_usd} cannot be held: backend.price of {cfg.name} is null")

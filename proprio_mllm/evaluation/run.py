@@ -29,7 +29,7 @@ from data.code_files import source_digest, split_source
 from data.files import file_hash, write_text
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.backends.identity import identity_of
-from proprio_mllm.backends.making import make_backend
+from proprio_mllm.backends.making import check_cap, make_backend
 from proprio_mllm.evaluation.batching import batch_planner
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
 from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledger, scored
@@ -237,6 +237,7 @@ def _ready(cfg: EvalConfig) -> EvalConfig:
     if backend.source is not None:
         file, name = split_source(backend.source, "backend.source", "function")
         backend = dataclasses.replace(backend, source=f"{found(str(file)).absolute()}:{name}")
+    check_cap(backend, cfg.cost_cap_usd)
     if backend.kind != "local":  # whose model is loaded once, where it answers
         make_backend(backend, None).close()
     return dataclasses.replace(cfg, backend=backend)
