@@ -12,6 +12,7 @@ from configs.schema.backend import BackendConfig
 from configs.schema.eval import PlannerConfig
 from data.records import Feedback, Observation
 from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest
+from proprio_mllm.backends.structured import strict_schema
 from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.chat.rap import Outline, RapPlanner, Thought
 from proprio_mllm.planners.chat.replies import Reflection
@@ -237,6 +238,11 @@ def test_a_new_episode_forgets_the_last_one(start) -> None:
     planner.reset(INFO, np.random.default_rng(1))
     followed(planner, [""])
     assert kinds(script) == ["Outline", "Thought", "Thought", "Outline", "Thought"]
+
+
+@pytest.mark.parametrize(("kind", "names"), [(Outline, ["plan", "key"]), (Thought, ["thought", "key", "steps"])])
+def test_strict_servers_take_the_schemas(kind: type[Outline | Thought], names: list[str]) -> None:
+    assert strict_schema(kind)["required"] == names
 
 
 def test_it_needs_a_memory() -> None:
