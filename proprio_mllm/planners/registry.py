@@ -11,8 +11,10 @@ from typing import Final
 from configs.schema.backend import BackendConfig
 from configs.schema.eval import PlannerConfig
 from proprio_mllm.backends.protocol import Backend
+from proprio_mllm.planners.chat.llm_planner import LlmPlanner
 from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.chat.plain import PlainPlanner
+from proprio_mllm.planners.chat.rap import RapPlanner
 from proprio_mllm.planners.file_planner import load_planner
 from proprio_mllm.planners.protocol import Planner
 from proprio_mllm.planners.random_planner import RandomPlanner
@@ -63,7 +65,9 @@ def make_planner(cfg: PlannerConfig) -> Planner:
 
 
 CHAT_PLANNERS: Final[Mapping[str, Callable[[Backend, ChatOptions], Planner]]] = {
+    "llm_planner": LlmPlanner,
     "plain": PlainPlanner,
+    "rap": RapPlanner,
 }
 
 
