@@ -98,7 +98,7 @@ def left_over(plan: Sequence[str], log: Sequence[str]) -> list[str]:
 
 
 def careless(log: Sequence[str]) -> int:
-    """Steps of the plan that somebody who does not read results takes for done: every one, but what was done again counts once."""
+    """Steps of the plan that somebody who does not read results takes for done: all, what was done again counting once."""
     steps = [" & ".join(re.findall(r"\w+\([^()]*\)", line)) for line in log]
     return len(steps) - sum(step == before for before, step in itertools.pairwise(steps))
 
