@@ -44,10 +44,11 @@ def plans() -> dict[tuple[str, str], tuple[str, tuple[str, ...]]]:
 def answer(request: ChatRequest) -> ChatReply:
     """The reply that the request's schema asks for."""
     text = "\n".join(message.text for message in request.messages)
-    instruction = re.findall(r"^Task: (.*)$", text, re.M)[-1]
     robot = re.findall(r"dual-arm humanoid (\w+)", text)[0].lower()
-    task, plan = plans()[instruction, robot]
-    log = list(re.findall(r"^\d+\. (.*)$", text.rpartition("Log:")[2], re.M))
+    scene = re.search(r"^Task: ([^\n]*)\nThis is step.*?^Log:\n(.*?)^The picture is", text, re.M | re.S)
+    assert scene is not None
+    task, plan = plans()[scene[1], robot]
+    log = list(re.findall(r"^\d+\. (.*)$", scene[2], re.M))
     assert request.schema is not None
     reply = FORMS[request.schema.__name__](task, plan, log)
     written = reply if isinstance(reply, str) else json.dumps(reply)
