@@ -11,7 +11,7 @@ export WANDB_MODE ?= offline
 # Model weights come from this repository or from a path you give, never from a hub.
 export HF_HUB_OFFLINE ?= 1
 
-.PHONY: setup eval test check motions lock third-party clean
+.PHONY: setup eval test check serve motions lock third-party clean
 
 setup: $(STAMP)
 
@@ -33,6 +33,10 @@ check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+
+# The released tiny base model behind OpenAI's chat API on http://127.0.0.1:8377/v1, or another: SERVE_ARGS="weights=... port=...".
+serve: $(STAMP)
+	$(BIN)/python -m proprio_mllm.backends.serve $(SERVE_ARGS)
 
 # Real human motion (two OMOMO clips, five climbing clips), data only: 100 MB, used by tests marked `motions`.
 motions: $(STAMP)

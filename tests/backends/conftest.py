@@ -9,7 +9,10 @@ from collections.abc import Iterator
 import pytest
 
 from configs.schema.backend import BackendConfig
+from tests.backends.checkpoints import ask, folder, internvl_folder, one_thread, open_chat, qwen_folder, view
 from tests.backends.loopback import KEY, LoopbackServer
+
+__all__ = ["ask", "folder", "internvl_folder", "one_thread", "open_chat", "qwen_folder", "view"]  # fixtures of all modules here
 
 
 @pytest.fixture
