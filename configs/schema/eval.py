@@ -62,6 +62,7 @@ class PlannerConfig:
         body: whether a backend's prompt tells proprioception in words; the paper's baselines have none.
         examples: tasks taken from memory by `llm_planner` and `rap`.
         memory: folder of the memory, made by `python -m proprio_mllm.planners.memory`.
+        parallel: whether `dag_plan` may use both arms in one step; false does one node at a time.
     """
 
     name: str
@@ -81,6 +82,7 @@ class PlannerConfig:
     body: bool = False
     examples: int = 0
     memory: str | None = None
+    parallel: bool = True
 
     def __post_init__(self) -> None:
         _require(self.name.isidentifier(), f"planner name {self.name!r} must be an identifier")
@@ -93,6 +95,7 @@ class PlannerConfig:
         needs = self.kind in ("llm_planner", "rap")
         _require((self.memory is not None) == needs, f"kind {self.kind!r} with memory {self.memory!r}")
         _require((self.examples > 0) == needs, f"kind {self.kind!r} with examples {self.examples}")
+        _require(self.parallel or self.kind == "dag_plan", f"kind {self.kind!r} with parallel {self.parallel}; allowed: True")
 
 
 @dataclass(frozen=True)

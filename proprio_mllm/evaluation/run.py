@@ -120,7 +120,7 @@ def config_hash(cfg: EvalConfig, digest: str) -> str:
         del planner[name]
     # what a planner's kind does not know, or leaves as it has always been, is no part of its runs' names
     defaults = {f.name: f.default for f in dataclasses.fields(PlannerConfig)}
-    for name in ("reflection", "replans", "horizon", "history", "body", "examples"):
+    for name in ("reflection", "replans", "horizon", "history", "body", "examples", "parallel"):
         if cfg.planner.kind not in CHAT_KINDS and planner[name] == defaults[name]:
             del planner[name]
     decides = {"planner": planner, "weights": digest, "robot": dataclasses.asdict(cfg.robot), "start": cfg.start}

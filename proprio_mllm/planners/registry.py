@@ -11,6 +11,7 @@ from typing import Final
 from configs.schema.backend import BackendConfig
 from configs.schema.eval import PlannerConfig
 from proprio_mllm.backends.protocol import Backend
+from proprio_mllm.planners.chat.dag_plan.planner import DagPlanner
 from proprio_mllm.planners.chat.llm_planner import LlmPlanner
 from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.chat.plain import PlainPlanner
@@ -65,6 +66,7 @@ def make_planner(cfg: PlannerConfig) -> Planner:
 
 
 CHAT_PLANNERS: Final[Mapping[str, Callable[[Backend, ChatOptions], Planner]]] = {
+    "dag_plan": DagPlanner,
     "llm_planner": LlmPlanner,
     "plain": PlainPlanner,
     "rap": RapPlanner,

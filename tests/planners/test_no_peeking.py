@@ -18,6 +18,7 @@ from proprio_mllm.backends.protocol import ChatRequest
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, GoalReport, RunnableSession, Stats, run_episode
 from proprio_mllm.evaluation.privileged import ExpertPlanner
 from proprio_mllm.evaluation.sessions import SimSession
+from proprio_mllm.planners.chat.dag_plan.planner import DagPlanner
 from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.chat.plain import PlainPlanner
 from proprio_mllm.planners.mllm import MllmPlanner
@@ -27,6 +28,7 @@ from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 from sim.session import Session
 from sim.tasks.predicates import Predicate
 from sim.tasks.task import Placement, Start, Task
+from tests.planners.chat.dag_plan.graphs import node, reply
 from tests.planners.chat.script import Script, plan, thought
 
 TASK = Task(
@@ -113,10 +115,19 @@ def steps_of(request: ChatRequest) -> str:
     return (thought if request.purpose == "reflection" else plan)(step)
 
 
+def graph_of(request: ChatRequest) -> str:
+    """A graph that depends on all of the prompt; its first node fails, so that there is something to reflect on."""
+    number = sum(len(message.text) for message in request.messages) % 2
+    nodes = (node("a", "ToggleOn(CounterTop_1)"), node("b", ("Open(Fridge_1)", "RotateLeft(45)")[number]))
+    return reply(*nodes, cause="no switch", change="none")
+
+
 def planners() -> dict[str, Callable[[list[Script]], Planner]]:
-    def chat(kind: Callable[..., Planner], **options) -> Callable[[list[Script]], Planner]:
+    def chat(
+        kind: Callable[..., Planner], answer: Callable[[ChatRequest], str] = steps_of, **options
+    ) -> Callable[[list[Script]], Planner]:
         def make(scripts: list[Script]) -> Planner:
-            scripts.append(Script(steps_of))
+            scripts.append(Script(answer))
             return kind(scripts[-1], ChatOptions(image_size=112, **options))
 
         return make
@@ -126,6 +137,7 @@ def planners() -> dict[str, Callable[[list[Script]], Planner]]:
         "scripted": lambda scripts: ScriptedPlanner(112),
         "mllm": lambda scripts: MllmPlanner.load(WEIGHTS),
         "plain": chat(PlainPlanner, body=True),
+        "dag_plan": chat(DagPlanner, graph_of),
     }
 
 

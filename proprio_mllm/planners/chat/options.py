@@ -25,6 +25,7 @@ class ChatOptions:
         body: whether the prompt tells proprioception in words.
         examples: tasks taken from memory.
         memory: folder of the memory, None for planners without one.
+        parallel: whether DAG-Plan may use both arms in one step.
     """
 
     image_size: int = 500
@@ -37,6 +38,7 @@ class ChatOptions:
     body: bool = False
     examples: int = 0
     memory: str | None = None
+    parallel: bool = True
 
     @staticmethod
     def of(planner: PlannerConfig, backend: BackendConfig) -> ChatOptions:
@@ -52,4 +54,5 @@ class ChatOptions:
             planner.body,
             planner.examples,
             planner.memory,
+            planner.parallel,
         )

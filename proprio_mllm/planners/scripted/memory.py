@@ -10,15 +10,12 @@ from typing import Final
 import numpy as np
 
 from data.records import Action, Observation
+from proprio_mllm.planners.furniture import CONTAINERS, SEATS, SURFACES
 from proprio_mllm.planners.scripted.belief import Belief
 from proprio_mllm.planners.scripted.words import Mention, candidates, type_of
 
 __all__ = ["Memory"]
 
-#: Where things usually are, in groups of decreasing likelihood.
-_SURFACES: Final = ("countertop", "diningtable", "coffeetable", "sidetable", "desk", "shelf", "dresser", "tvstand")
-_SEATS: Final = ("sofa", "bed", "chair", "stoveburner", "sinkbasin", "bathtubbasin", "toilet", "garbagecan")
-_CONTAINERS: Final = ("cabinet", "drawer", "fridge", "microwave", "laundryhamper", "box")
 #: How to look around at a place: names and amounts.
 _LOOKS: Final = (("RotateLeft", 45.0), ("RotateRight", 90.0), ("MoveBack", 0.3), ("RotateLeft", 45.0), ("MoveUp", 0.2))
 
@@ -118,14 +115,14 @@ class Memory:
     def _round(self, mention: Mention) -> list[Action]:
         named = None if mention.place is None else self.find(mention.place)
         order: list[str] = [] if named is None else [named]
-        for group in (_SURFACES, _SEATS, _CONTAINERS):
+        for group in (SURFACES, SEATS, CONTAINERS):
             names = sorted(name for name in self._known if type_of(name) in group and name != named)
             order += [names[int(index)] for index in self._rng.permutation(len(names))]
         steps = [] if named is not None else [Action("MoveUp", amount=0.2), *[Action("RotateLeft", amount=90.0)] * 3]
         for name in order:
             steps.append(Action("GoTo", object_id=name))
             free = self.belief.free_arms()
-            if type_of(name) in _CONTAINERS and free:
+            if type_of(name) in CONTAINERS and free:
                 steps.append(Action("Open", arm=free[0], object_id=name))
             looks = _LOOKS if name == named else _LOOKS[:2]
             steps += [Action(verb, amount=amount) for verb, amount in looks]
