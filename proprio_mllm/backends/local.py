@@ -12,6 +12,7 @@ Paper: the local baselines of Table II.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import threading
 import time
@@ -25,6 +26,7 @@ from proprio_mllm.backends.checkpoint import Loaded, find_checkpoint, load_check
 from proprio_mllm.backends.decoding import Limits, Rule, Rules
 from proprio_mllm.backends.gathering import Gathering
 from proprio_mllm.backends.grammar import Grammars, import_xgrammar
+from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest
 from proprio_mllm.backends.rows import Row, collate, encode, seed_of
 
@@ -57,8 +59,8 @@ class LocalChat:
         )
         #: Model and revision, as replies name them.
         self.model = f"{checkpoint.folder.resolve().name}@{revision}"
-        dtype = str(model.dtype).removeprefix("torch.")
-        self.identity = f"local {self.model} {dtype}" + (" constrained" if cfg.constrained else "")
+        #: As recorded replies are known: without a revision of the configuration, they belong to this fingerprint.
+        self.identity = identity_of(dataclasses.replace(cfg, revision=revision))
         #: Where it runs and with how many tokens of prompt and reply together, for people.
         self.device, self.context = str(model.device), self._loaded.context
         self._encoding = threading.Lock()  # tokenizers are not made for several threads at once

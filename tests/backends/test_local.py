@@ -22,6 +22,7 @@ from transformers import AutoModelForImageTextToText
 
 from data.records import PlanStep
 from proprio_mllm.backends import local
+from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.local import LocalChat
 from proprio_mllm.backends.processors import load_chat_processor
 from proprio_mllm.backends.protocol import Backend, BackendError, ChatImage, ChatMessage, ChatReply, ChatRequest
@@ -29,6 +30,7 @@ from proprio_mllm.backends.rows import RequestError, encode, open_picture
 from proprio_mllm.model.batch import Collator, Example, View
 from proprio_mllm.model.building import load_model
 from proprio_mllm.model.prompts import looking, plan_prompt
+from tests.backends.checkpoints import local_config
 
 Ask = Callable[..., ChatRequest]
 Look = Callable[..., ChatImage]
@@ -59,8 +61,10 @@ def test_a_chat_is_a_backend_and_names_itself(folder: Path, open_chat: Open) -> 
     name, revision = chat.model.split("@")
     assert name == folder.name
     assert len(revision) == 16
-    assert chat.identity == f"local {chat.model} float32"
-    assert open_chat(folder, revision="abc", dtype="bfloat16").identity == f"local {folder.name}@abc bfloat16"
+    asked = local_config(folder, revision=chat.model.partition("@")[2])
+    assert chat.identity == identity_of(asked)  # so that recorded replies are found again
+    named = local_config(folder, revision="abc", dtype="bfloat16")
+    assert open_chat(folder, revision="abc", dtype="bfloat16").identity == identity_of(named)
 
 
 def test_a_reply_is_the_naive_greedy_continuation(folder: Path, open_chat: Open, ask: Ask, view: Look) -> None:
