@@ -36,6 +36,7 @@ def main(overrides: Sequence[str]) -> int:
         sys.stdout.write(help_text("eval", EvalConfig, __doc__ or ""))
         return 0
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    logging.getLogger("httpx2").setLevel(logging.WARNING)  # a line per call would drown the progress bar
     console = Console(stderr=True, highlight=False)
     try:
         cfg = build(EvalConfig, compose("eval", overrides))

@@ -52,7 +52,7 @@ def compose(root: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
         allowed = ", ".join(sorted(path.stem for path in CONFIG_DIR.glob("*.yaml")))
         raise ConfigError(f"no root config {root!r}; allowed: {allowed}")
     _check_groups(overrides)
-    overrides = _name_own_robots(overrides)
+    overrides = _add_fields(_name_own_robots(overrides))
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(config_dir=str(CONFIG_DIR), version_base=None):
@@ -76,6 +76,12 @@ def _name_own_robots(overrides: Sequence[str]) -> list[str]:
         else:
             spelled.append(override)
     return spelled
+
+
+def _add_fields(overrides: Sequence[str]) -> list[str]:
+    """Lets fields be set that a group's file leaves at their defaults; `build` refuses those that do not exist."""
+    open_groups = ("backend.", "planner.")
+    return [f"++{override}" if override.startswith(open_groups) else override for override in overrides]
 
 
 def _check_groups(overrides: Sequence[str]) -> None:

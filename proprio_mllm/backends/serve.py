@@ -92,7 +92,7 @@ def main(arguments: Sequence[str]) -> int:
             sys.stderr.write(f"serve: {error}\n")
             return 1
         stack.callback(server.server_close)
-        sys.stdout.write(f"{server.url} answers as {name}: {backend.identity} on {backend.device}\n")
+        sys.stdout.write(f"{server.url} answers as {name}: {backend.model} on {backend.device}\n")
         sys.stdout.flush()
         server.serve_forever()
     return 0

@@ -184,11 +184,19 @@ def run_folder(cfg: EvalConfig, digest: str) -> Path:
     return Path(cfg.output) / "eval" / "-".join([*parts, config_hash(cfg, digest)[:6]])
 
 
+def _label(cfg: EvalConfig) -> str:
+    """The planner's label, with the model where that is not the one of the label."""
+    if cfg.backend is None or cfg.backend.name == cfg.planner.name:
+        return cfg.planner.label
+    planner = "Plain prompting" if cfg.planner.kind == "plain" else cfg.planner.label
+    return f"{planner} on {cfg.backend.model or cfg.backend.name}"
+
+
 def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileged: bool) -> dict[str, Any]:
     return {
         "version": RUN_VERSION,
         "planner": cfg.planner.name,
-        "label": cfg.planner.label,
+        "label": _label(cfg),
         "privileged": privileged,
         "robot": cfg.robot.name,
         "difficulty": cfg.difficulty,
@@ -238,7 +246,14 @@ def _ready(cfg: EvalConfig) -> EvalConfig:
         file, name = split_source(backend.source, "backend.source", "function")
         backend = dataclasses.replace(backend, source=f"{found(str(file)).absolute()}:{name}")
     check_cap(backend, cfg.cost_cap_usd)
-    if backend.kind != "local":  # whose model is loaded once, where it answers
+    if backend.kind == "local":  # whose weights are loaded once, where they answer
+        from proprio_mllm.backends.checkpoint import find_checkpoint  # imports torch
+
+        checkpoint = find_checkpoint(str(found(backend.model)))
+        backend = dataclasses.replace(
+            backend, model=str(found(backend.model)), revision=backend.revision or checkpoint.fingerprint()
+        )
+    else:
         make_backend(backend, None).close()
     return dataclasses.replace(cfg, backend=backend)
 

@@ -1,0 +1,51 @@
+"""The whole way of an API planner: eval, the OpenAI client, and the local server with the released tiny model."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from configs.compose import compose
+from configs.schema.backend import BackendConfig
+from configs.schema.eval import EvalConfig
+from configs.validate import build
+from proprio_mllm.backends.local import LocalChat
+from proprio_mllm.backends.server import ChatServer
+from proprio_mllm.evaluation.run import evaluate
+
+TINY = Path(__file__).resolve().parents[2] / "weights/tiny/base"
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    chat = LocalChat(BackendConfig("local", "served", model=str(TINY), device="cpu", batch=4, cache=None))
+    server = ChatServer(chat, "base", 0, False)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield server.url
+    server.shutdown()
+    server.server_close()
+    chat.close()
+
+
+def test_a_planner_asks_the_served_model_and_repeats_the_run_without_it(url: str, tmp_path: Path) -> None:
+    cache = tmp_path / "replies.sqlite"
+    values = ["planner=gpt4o", "backend=serve", f"backend.base_url={url}", f"backend.cache={cache}", "robot=x1", "limit=1"]
+    cfg = build(EvalConfig, compose("eval", [*values, "workers=0", "threads=3", f"output={tmp_path / 'a'}"]))
+    first = evaluate(cfg)
+    assert not first.broken
+    assert len(first.records) == 3
+    assert all(record.planner_calls > 0 and record.planner_tokens > 1000 for record in first.records)
+    assert {model.partition("@")[0].split()[0] for record in first.records for model in record.models} == {"base"}
+    assert cfg.backend is not None
+    nowhere = dataclasses.replace(cfg.backend, kind="replay", base_url="http://127.0.0.1:9/v1")
+    again = evaluate(dataclasses.replace(cfg, backend=nowhere, output=str(tmp_path / "b"), threads=1))
+    for record, replayed in zip(first.records, again.records, strict=True):
+        assert replayed.cached_calls == replayed.planner_calls
+        assert replayed.trace == record.trace
+        assert (replayed.outcome, replayed.planner_tokens, replayed.models) == (
+            record.outcome, record.planner_tokens, record.models
+        )  # fmt: skip
