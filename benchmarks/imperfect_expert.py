@@ -51,6 +51,8 @@ def answer(request: ChatRequest) -> ChatReply:
     log = list(re.findall(r"^\d+\. (.*)$", scene[2], re.M))
     assert request.schema is not None
     reply = FORMS[request.schema.__name__](task, plan, log)
+    if request.schema.__name__ == "GraphReply" and draw(task, 0, 1000) < 1000 * MISTAKES and "nowhere" not in text:
+        reply = {"nodes": [node | {"after": ["nowhere"]} for node in nodes(plan, ())]}  # what a planner asks to be mended
     written = reply if isinstance(reply, str) else json.dumps(reply)
     return ChatReply(written, len(text) // 4, len(written) // 4, model="imperfect-expert")
 
@@ -152,7 +154,8 @@ def nodes(plan: Sequence[str], done: Sequence[tuple[str, str | None]]) -> list[d
             node["after"] = list(dict.fromkeys(touched[thing] for thing in about if thing in touched))
             found.append(node | ({"item": item} if kind in ("release", "tool-use") else {}) | {"at": where or None})
             touched |= dict.fromkeys(about, name)
-    return found
+    end = {"id": "end", "action": "Done()", "type": "complete", "arms": 1, "after": [node["id"] for node in found]}
+    return [*found, end]
 
 
 def _graph(task: str, plan: Sequence[str], log: Sequence[str]) -> dict[str, object] | str:
