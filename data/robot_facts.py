@@ -9,6 +9,7 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.robots.kinematics import RobotModel
 from sim.robots.spec import KEY_BODIES, SIDES, RobotSpec, load_robot
@@ -59,7 +60,7 @@ def robot_facts(name: str) -> RobotFacts:
 def _facts(spec: RobotSpec) -> RobotFacts:
     model = RobotModel(spec)
     root = np.array([0.0, 0.0, spec.standing_pelvis_height_m, 1.0, 0.0, 0.0, 0.0])
-    keys = dict(zip(KEY_BODIES, model.key_body_positions(root, model.posture()), strict=True))
+    keys: dict[str, NDArray[np.float64]] = dict(zip(KEY_BODIES, model.key_body_positions(root, model.posture()), strict=True))
     lengths, heights = [], []
     for side in SIDES:
         shoulder, elbow, hand = (keys[f"{side}_{part}"] for part in ("shoulder", "elbow", "hand"))

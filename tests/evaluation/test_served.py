@@ -16,6 +16,8 @@ from configs.validate import build
 from proprio_mllm.backends.local import LocalChat
 from proprio_mllm.backends.server import ChatServer
 from proprio_mllm.evaluation.run import evaluate
+from proprio_mllm.planners.memory_build import MemoryConfig, build_memory
+from tests.planners.demonstrations import write_demos
 
 TINY = Path(__file__).resolve().parents[2] / "weights/tiny/base"
 
@@ -31,9 +33,20 @@ def url() -> Iterator[str]:
     chat.close()
 
 
-def test_a_planner_asks_the_served_model_and_repeats_the_run_without_it(url: str, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def memory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("served")
+    build_memory(MemoryConfig(str(write_demos(folder / "demos")), str(folder / "memory")), "a test")
+    return folder / "memory"
+
+
+@pytest.mark.parametrize("planner", ["gpt4o", "llm_planner", "rap", "dag_plan"])
+def test_a_planner_asks_the_served_model_and_repeats_the_run_without_it(
+    planner: str, url: str, memory: Path, tmp_path: Path
+) -> None:
     cache = tmp_path / "replies.sqlite"
-    values = ["planner=gpt4o", "backend=serve", f"backend.base_url={url}", f"backend.cache={cache}", "robot=x1", "limit=1"]
+    values = [f"planner={planner}", "backend=serve", f"backend.base_url={url}", f"backend.cache={cache}", "robot=x1", "limit=1"]
+    values += [f"planner.memory={memory}"] if planner in ("llm_planner", "rap") else []
     cfg = build(EvalConfig, compose("eval", [*values, "workers=0", "threads=3", f"output={tmp_path / 'a'}"]))
     first = evaluate(cfg)
     assert not first.broken
