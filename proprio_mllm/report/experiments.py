@@ -81,11 +81,19 @@ def _costs(shown: Sequence[Run]) -> tuple[str, ...]:
     )  # fmt: skip
 
 
+def _rate(run: Run | None, category: str) -> str:
+    """A cell of ours; of a run that is not finished it says how many episodes there will be."""
+    row = None if run is None else run.row(category)
+    if run is None or row is None:
+        return ""
+    planned = run.planned(category)
+    return rate_cell(row) if row.episodes == planned else f"{rate_cell(row)} of {planned}"
+
+
 def _own_row(title: str, cells: Sequence[tuple[Run | None, str]]) -> tuple[str, ...]:
     """A row of ours from (run, category) per cell."""
-    rates = [None if run is None else run.row(category) for run, category in cells]
     shown = [run for run, _ in cells if run is not None]
-    return (title, "ours", *("" if row is None else rate_cell(row) for row in rates), *_costs(shown))
+    return (title, "ours", *(_rate(run, category) for run, category in cells), *_costs(shown))
 
 
 def _paper_row(method: str, values: Mapping[Any, float], places: Sequence[Any]) -> tuple[str, ...]:
@@ -108,8 +116,9 @@ def main_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
     body += [_paper_row(method, values, places) for method, values in paper.items()]
     columns = ("planner", "source", *(f"{category} {robot}" for category, robot in places), *_COSTS)
     notes = (
-        "ours: success in %, 95 % interval over tasks, successes/episodes. calls, tokens, USD: means per episode; invalid: "
-        "share of calls; broken: attempts that failed for reasons outside the planner, run again and not scored.",
+        "ours: success in %, 95 % interval over tasks, successes/episodes, `of N` in a run that is not finished. calls, "
+        "tokens, USD: means per episode; invalid: share of calls; broken: attempts that failed for reasons outside the "
+        "planner, run again and not scored.",
         _PAPER_NOTE,
     )
     return Table(f"Success by category ({difficulty})", columns, tuple(body), notes)
@@ -151,7 +160,9 @@ def ablation_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
         run = newest(runs, name, robot, difficulty, "essential")
         row = None if run is None else run.row("essential")
         own = (
-            ("", "", "", "") if row is None else (rate_cell(row), *map(str, (row.navigation, row.body_adjustment, row.logical)))
+            ("", "", "", "")
+            if row is None
+            else (_rate(run, "essential"), *map(str, (row.navigation, row.body_adjustment, row.logical)))
         )
         values = paper.get(PAPER_ROWS.get(name, (None, None, None))[2] or "")
         printed = ("", "", "", "")

@@ -78,6 +78,10 @@ class Run:
         """The row of one category, None when the run has no such task."""
         return next((row for row in self.rows() if row.category == category and row.episodes), None)
 
+    def planned(self, category: str) -> int:
+        """Episodes of one category that were planned."""
+        return sum(category in ("all", one) for _, one, _, _ in self.metadata["planned"])
+
 
 def read_metadata(folder: Path) -> dict[str, Any]:
     """Contents of a run's `run.json`.

@@ -154,6 +154,22 @@ def test_main_table_keeps_ours_and_the_papers_apart(tmp_path, run) -> None:
     assert next(row for row in table.rows if row[:2] == ("Proprio-MLLM", "paper"))[column] == "63.16"
 
 
+def test_a_run_that_is_not_finished_says_so_in_every_table(tmp_path, run) -> None:
+    ledger = run(tmp_path, "proprio", "h1") / "ledger.jsonl"
+    lines = ledger.read_text().splitlines(keepends=True)
+    last = next(n for n in range(len(lines) - 1, -1, -1) if '"essential"' in lines[n])
+    ledger.write_text("".join(lines[:last]))
+    runs = find_runs(tmp_path)
+    main = main_table(ExperimentConfig("main_table", ("proprio",)), runs)
+    essential = main.rows[0][main.columns.index("essential h1")]
+    planned = runs[0].planned("essential")
+    assert runs[0].planned("all") == len(lines)
+    assert essential.endswith(f"/{planned - 1} of {planned}")
+    assert " of " not in main.rows[0][main.columns.index("single h1")]
+    assert replanning_table(ExperimentConfig("replanning_table", ("proprio",), ("h1",)), runs).rows[0][2] == essential
+    assert ablation_table(ExperimentConfig("ablation_table", ("proprio",), ("h1",)), runs).rows[0][1] == essential
+
+
 def test_ablation_and_replanning(tmp_path, run) -> None:
     run(tmp_path, "proprio", "h1", "easy")
     run(tmp_path, "proprio", "h1", "hard", seed=1)
