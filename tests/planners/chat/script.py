@@ -19,7 +19,7 @@ from data.records import (
     Proprioception,
 )
 from proprio_mllm.backends.protocol import ChatReply, ChatRequest
-from proprio_mllm.planners.protocol import TaskInfo
+from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
 
 INFO = TaskInfo("pick up the mug", "h1", 9)
 
@@ -70,3 +70,18 @@ def acted(before: Observation, step: str, code: str = "") -> tuple[Observation, 
     feedback = Feedback(tuple(outcomes), 1.0)
     history = (*before.history, HistoryItem(step, feedback.to_text()))
     return dataclasses.replace(before, history=history, step=len(history)), feedback
+
+
+def followed(planner: Planner, codes: list[str]) -> list[PlannerReply]:
+    """Replies of an episode whose steps end with these codes, empty for success."""
+    seen: Observation = observation()
+    feedback: Feedback | None = None
+    replies: list[PlannerReply] = []
+    for code in codes:
+        reply = planner.step(seen, feedback)
+        replies.append(reply)
+        if reply.step is None:
+            feedback = None
+        else:
+            seen, feedback = acted(seen, reply.step.to_text(), code)
+    return replies

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data.records import Feedback, Observation, PlanStep
+from data.records import PlanStep
 from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest
 from proprio_mllm.planners.chat.embedding import SentenceEmbedder
 from proprio_mllm.planners.chat.llm_planner import LlmPlanner, example_text, with_known_names
 from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.memory import MemoryFileError, read_memory
 from proprio_mllm.planners.protocol import Planner, PlannerReply
-from tests.planners.chat.script import INFO, Script, acted, observation, plan, thought
+from tests.planners.chat.script import INFO, Script, acted, followed, observation, plan, thought
 from tests.planners.demonstrations import DEMOS, PICK, SLICE, STOW
 
 
@@ -30,21 +30,6 @@ def start(blind_memory_folder: Path):
         return planner
 
     return make
-
-
-def followed(planner: LlmPlanner, codes: list[str]) -> list[PlannerReply]:
-    """Replies of an episode whose steps end with these codes, empty for success."""
-    seen: Observation = observation()
-    feedback: Feedback | None = None
-    replies: list[PlannerReply] = []
-    for code in codes:
-        reply = planner.step(seen, feedback)
-        replies.append(reply)
-        if reply.step is None:
-            feedback = None
-        else:
-            seen, feedback = acted(seen, reply.step.to_text(), code)
-    return replies
 
 
 def steps(replies: list[PlannerReply]) -> list[str]:

@@ -10,16 +10,15 @@ import pytest
 
 from configs.schema.backend import BackendConfig
 from configs.schema.eval import PlannerConfig
-from data.records import Feedback, Observation
 from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest
 from proprio_mllm.backends.structured import strict_schema
 from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.chat.rap import Outline, RapPlanner, Thought
 from proprio_mllm.planners.chat.replies import Reflection
 from proprio_mllm.planners.memory import MemoryFileError
-from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
+from proprio_mllm.planners.protocol import Planner, TaskInfo
 from proprio_mllm.planners.registry import make_chat_planner
-from tests.planners.chat.script import INFO, Script, acted, observation, thought
+from tests.planners.chat.script import INFO, Script, followed, observation, thought
 from tests.planners.demonstrations import DEMOS, LAMP, PICK, SLICE, STOW
 
 
@@ -53,21 +52,6 @@ def start(request: pytest.FixtureRequest, memory_folder: Path, blind_memory_fold
         return planner
 
     return make
-
-
-def followed(planner: RapPlanner, codes: list[str]) -> list[PlannerReply]:
-    """Replies of an episode whose steps end with these codes, empty for success."""
-    seen: Observation = observation()
-    feedback: Feedback | None = None
-    replies: list[PlannerReply] = []
-    for code in codes:
-        reply = planner.step(seen, feedback)
-        replies.append(reply)
-        if reply.step is None:
-            feedback = None
-        else:
-            seen, feedback = acted(seen, reply.step.to_text(), code)
-    return replies
 
 
 def kinds(script: Script) -> list[str]:
