@@ -63,6 +63,7 @@ def test_every_yaml_composes(path: Path) -> None:
         ("train", "model.mpe.mode=none", r"model\.mpe: mode|model\.mpe\.mode: 'none' is not allowed; allowed: mrope"),
         ("eval", "planner=oracle", r"planner='oracle' is not allowed; allowed: base, dag_plan, expert"),
         ("eval", "robot=atlas", r"robot='atlas' is not allowed; allowed: h1, x1"),
+        ("eval", "backend=null", r"backend='null' is not allowed; allowed: gemini, gpt4o"),
         ("eval", "trials=0", r"trials 0 must be positive"),
         ("train", "alignment.mask=1.5", r"mask 1\.5 outside \[0, 1\]"),
         ("eval", "trials", r"override 'trials': expected key=value"),
