@@ -109,6 +109,7 @@ def test_ends_of_replies(cfg: BackendConfig, server: LoopbackServer, body: objec
         ({"prompt_tokens": "100", "completion_tokens": 1, "total_tokens": 101}, (0, 0)),
         ({"prompt_tokens": -1, "completion_tokens": 1, "total_tokens": 0}, (0, 0)),
         ({"prompt_tokens": 5, "completion_tokens": None, "total_tokens": 9}, (0, 0)),
+        ({"prompt_tokens": 10**400, "completion_tokens": 1, "total_tokens": 1}, (0, 0)),
         ({"prompt_tokens": 5, "completion_tokens": 2}, (5, 2)),
         ({"prompt_tokens": 5, "completion_tokens": 2, "total_tokens": 17}, (5, 12)),  # thoughts are in the total alone
     ],
@@ -204,6 +205,12 @@ def test_errors_of_other_forms(cfg: BackendConfig, server: LoopbackServer, body:
 def test_a_content_policy_is_a_refusal(cfg: BackendConfig, server: LoopbackServer, error: dict) -> None:
     server.answer = lambda handler: handler.send(400, {"error": error})
     assert dataclasses.replace(reply_of(cfg), latency_s=0.0) == ChatReply("", finish_reason="refusal", model="some-model")
+
+
+def test_a_model_name_is_one_short_line(cfg: BackendConfig, server: LoopbackServer) -> None:
+    server.answer = lambda handler: handler.send(200, completion(model="gpt\n\x1b[31m4" + "o" * 10**6))
+    name = reply_of(cfg).model
+    assert (name[:12], len(name)) == ("gpt [31m4ooo", 200)
 
 
 def test_429_then_a_reply(cfg: BackendConfig, server: LoopbackServer) -> None:
