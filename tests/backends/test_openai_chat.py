@@ -15,7 +15,15 @@ from pydantic import BaseModel
 
 from configs.schema.backend import BackendConfig
 from proprio_mllm.backends.openai_chat import OpenAIChat
-from proprio_mllm.backends.protocol import Backend, BackendError, BackendSetupError, ChatReply, ChatRequest, LostReplyError
+from proprio_mllm.backends.protocol import (
+    Backend,
+    BackendError,
+    BackendSetupError,
+    ChatReply,
+    ChatRequest,
+    LostReplyError,
+    UnreachableError,
+)
 from tests.backends.loopback import IMAGE, KEY, Handler, LoopbackServer, ask, completion
 
 
@@ -274,7 +282,7 @@ def test_a_connection_cut_in_a_reply(cfg: BackendConfig, server: LoopbackServer)
 
 def test_nobody_listens(cfg: BackendConfig) -> None:
     error = error_of(cfg, base_url="http://127.0.0.1:1/v1")
-    assert type(error) is BackendError and "no connection after 1 attempt: ConnectError" in str(error)
+    assert type(error) is UnreachableError and "no connection after 1 attempt: ConnectError" in str(error)
 
 
 @pytest.mark.parametrize("status", [200, 500])
