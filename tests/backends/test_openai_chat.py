@@ -354,6 +354,13 @@ def test_a_proxy_of_the_environment_is_passed_by_on_this_machine(cfg: BackendCon
     assert reply_of(cfg).text == "Pick(left, Mug_1)"
 
 
+@pytest.mark.parametrize(("variable", "value"), [("ALL_PROXY", "socks4://127.0.0.1:9"), ("SSL_CERT_FILE", "/nowhere.pem")])
+def test_an_environment_that_cannot_be_used(cfg: BackendConfig, monkeypatch, variable: str, value: str) -> None:
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(BackendSetupError, match=r"backend tested: HTTP cannot be used as the environment asks .*: \w+Error: "):
+        OpenAIChat(dataclasses.replace(cfg, base_url="https://example.com/v1"))
+
+
 def test_missing_keys(cfg: BackendConfig, server: LoopbackServer, monkeypatch, caplog) -> None:
     monkeypatch.delenv("TEST_API_KEY")
     assert reply_of(cfg).text == "Pick(left, Mug_1)"
