@@ -15,7 +15,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from data.records import EpisodeRecord, FailureCategory, Outcome
+from configs.validate import ConfigError, build
+from data.records import EpisodeRecord, Outcome
 
 __all__ = ["LEDGER_VERSION", "EpisodeKey", "Ledger", "LedgerError", "key_of", "read_ledger", "scored"]
 
@@ -53,7 +54,7 @@ def from_json(raw: Mapping[str, Any]) -> EpisodeRecord:
     """Reads `to_json` back, and lines of version 1.
 
     Raises:
-        LedgerError: on another version, or missing or unknown fields.
+        LedgerError: on another version, missing or unknown fields, or a value of another type.
     """
     values = dict(raw)
     version = values.pop("version", None)
@@ -62,10 +63,10 @@ def from_json(raw: Mapping[str, Any]) -> EpisodeRecord:
     names = {f.name for f in dataclasses.fields(EpisodeRecord)} - (_SINCE_2 if version == 1 else frozenset())
     if set(values) != names:
         raise LedgerError(f"missing fields {sorted(names - set(values))}, unknown fields {sorted(set(values) - names)}")
-    values["outcome"] = Outcome(values["outcome"])
-    values["failure"] = None if values["failure"] is None else FailureCategory(values["failure"])
-    values["trace"], values["models"] = tuple(values["trace"]), tuple(values.get("models", ()))
-    return EpisodeRecord(**values)
+    try:
+        return build(EpisodeRecord, values)
+    except ConfigError as error:
+        raise LedgerError(str(error)) from error
 
 
 def read_ledger(path: Path) -> list[EpisodeRecord]:

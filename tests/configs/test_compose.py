@@ -72,11 +72,13 @@ def test_every_yaml_composes(path: Path) -> None:
         ("train", "selu.temperature=0", r"temperature 0\.0 must be positive"),
         ("train", "model.motion.window=128", r"window 128 must be at most 64"),
         ("eval", "planner.colour=red", r"planner\.colour: unknown key"),
+        ("eval", "experiment=main_table experiment.robots=[]", r"experiment: robots \(\) must name at least one"),
+        ("eval", "experiment=main_table experiment.difficulties=[]", r"difficulties \(\) must name at least one"),
     ],
 )
 def test_wrong_entries_stop_at_once(root: str, override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        build(ROOTS[root], compose(root, [override]))
+        build(ROOTS[root], compose(root, override.split()))
 
 
 def test_unknown_root() -> None:
