@@ -8,6 +8,7 @@ but they do not count as done: they are run again.
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import json
 import os
 from collections.abc import Iterable, Mapping
@@ -97,22 +98,28 @@ def scored(records: Iterable[EpisodeRecord]) -> dict[EpisodeKey, EpisodeRecord]:
 
 
 class Ledger:
-    """Appends to a ledger file; one process writes.
+    """Appends to a ledger file; one process writes, and the system gives its lock back when it ends.
 
     Args:
         path: made with its folder when absent; a line that was cut short is removed.
+
+    Raises:
+        LedgerError: when another process writes it.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_file():
-            content = path.read_bytes()
-            whole = content.rfind(b"\n") + 1
-            if whole != len(content):
-                with path.open("r+b") as handle:
-                    handle.truncate(whole)
         self._handle = path.open("ab")
+        try:
+            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._handle.close()
+            raise LedgerError(f"{path} is being written by another process: the same command is running already") from None
+        content = path.read_bytes()
+        whole = content.rfind(b"\n") + 1
+        if whole != len(content):
+            self._handle.truncate(whole)
 
     def append(self, record: EpisodeRecord) -> None:
         """Writes one record and waits until it is on the disk."""

@@ -42,6 +42,16 @@ def test_a_cut_line_is_dropped_and_overwritten(tmp_path, record) -> None:
     assert path.read_bytes() == whole * 2
 
 
+def test_two_writers_are_one_too_many(tmp_path, record) -> None:
+    path = tmp_path / "ledger.jsonl"
+    with Ledger(path) as ledger:
+        ledger.append(record)
+        with pytest.raises(LedgerError, match=r"ledger\.jsonl is being written by another process"):
+            Ledger(path)
+    Ledger(path).close()
+    assert read_ledger(path) == [record]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
