@@ -29,8 +29,8 @@ def main(overrides: Sequence[str]) -> int:
         overrides: `key=value` pairs of `configs/eval.yaml`.
 
     Returns:
-        0; 1 when episodes stay without a score, weights or a backend are absent, or a table cannot be assembled; 2 on a wrong
-        key, value or ledger.
+        0; 1 when episodes stay without a score, weights, a package or a backend are absent, a file cannot be written, or a
+        table cannot be assembled; 2 on a wrong key, value or ledger.
     """
     if asks_for_help(overrides):
         sys.stdout.write(help_text("eval", EvalConfig, __doc__ or ""))
@@ -45,6 +45,7 @@ def main(overrides: Sequence[str]) -> int:
         return 2
     from proprio_mllm.backends.protocol import BackendError
     from proprio_mllm.evaluation.run import evaluate  # loads the simulator; a typo above stops before that
+    from proprio_mllm.planners.chat.embedding import EmbeddingError
     from proprio_mllm.planners.protocol import WeightsError
     from proprio_mllm.report.experiments import assemble
     from proprio_mllm.report.runs import load_run, write_report
@@ -52,7 +53,7 @@ def main(overrides: Sequence[str]) -> int:
     if cfg.experiment is not None:
         try:
             table, files = assemble(cfg.experiment, Path(cfg.output))
-        except ValueError as error:
+        except (ValueError, OSError) as error:
             console.print(f"eval.py: {error}", style="red", markup=False, soft_wrap=True)
             return 1
         console.print("\n".join(f"written: {path}" for path in files), markup=False, soft_wrap=True)
@@ -61,12 +62,12 @@ def main(overrides: Sequence[str]) -> int:
         return 0
     try:
         done = evaluate(cfg)
-    except (WeightsError, BackendError, ValueError) as error:
+        folder = done.folder
+        run = load_run(folder)
+        table = write_report(run)
+    except (WeightsError, BackendError, EmbeddingError, OSError, ValueError) as error:
         console.print(f"eval.py: {error}", style="red", markup=False, soft_wrap=True)
-        return 1 if isinstance(error, (WeightsError, BackendError)) else 2
-    folder = done.folder
-    run = load_run(folder)
-    table = write_report(run)
+        return 2 if isinstance(error, ValueError) else 1
     if done.stopped:
         console.print(f"eval.py: the run has stopped: {done.stopped}", style="red", markup=False, soft_wrap=True)
     console.print(f"ledger, summary.json and tables: {folder}", markup=False, soft_wrap=True)

@@ -92,7 +92,7 @@ def _check_groups(overrides: Sequence[str]) -> None:
         if not sep and not key.startswith("~"):
             raise ConfigError(f"override {override!r}: expected key=value")
         name = key.lstrip("+")
-        if name in known and value not in known[name] and value != "null":
+        if name in known and value not in known[name]:
             raise ConfigError(f"{name}={value!r} is not allowed; allowed: {', '.join(known[name])}")
 
 

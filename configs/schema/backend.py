@@ -70,6 +70,8 @@ class BackendConfig:
         _require(self.name.isidentifier(), f"backend name {self.name!r} must be an identifier")
         _require(bool(self.model) or self.kind == "scripted", f"backend kind {self.kind!r} needs a model, got ''")
         _require((self.source is not None) == (self.kind == "scripted"), f"kind {self.kind!r} with source {self.source!r}")
+        # not shown: whoever gives something else gives the key
+        _require(self.key_env.isidentifier(), "key_env is the name of an environment variable; a key itself is never an option")
         _require(self.kind != "replay" or self.cache is not None, "backend kind 'replay' needs a cache, got null")
         _require(self.timeout_s > 0.0, f"timeout_s {self.timeout_s} must be positive")
         _require(0 <= self.retries <= 20, f"retries {self.retries} outside [0, 20]")

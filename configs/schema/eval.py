@@ -114,6 +114,10 @@ class ExperimentConfig:
     robots: tuple[str, ...] = ("x1", "h1")
     difficulties: tuple[DifficultyName, ...] = ("easy",)
 
+    def __post_init__(self) -> None:
+        for name in ("planners", "robots", "difficulties"):
+            _require(bool(getattr(self, name)), f"{name} () must name at least one")
+
 
 @dataclass(frozen=True)
 class EvalConfig:

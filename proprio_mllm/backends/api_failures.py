@@ -5,7 +5,7 @@ By status and cause:
 - no key, a wrong one, an unknown model or path, a redirect, no money left: `BackendSetupError`;
 - 400 and 422 are read: about the key, the model or a parameter that every call sends, `BackendSetupError`; a content policy is
   a refusal, which is a reply; the rest (a prompt too long, a picture that cannot be read) is this request's, `BackendError`;
-- 408, 409, 413, 429, 5xx, no connection: `BackendError`;
+- 408, 409, 413, 429, 5xx: `BackendError`; no connection: `UnreachableError`;
 - time-outs, connections that break, gateways that got no answer, bodies too long: `LostReplyError`, since it may be charged.
 
 Servers differ in the form of their errors: an object `error`, the same in a list (Gemini), `message` or `detail` alone (vLLM),
@@ -22,7 +22,7 @@ import httpx2
 import openai
 
 from proprio_mllm.backends.http_client import ReplyTooLongError
-from proprio_mllm.backends.protocol import BackendError, BackendSetupError, LostReplyError
+from proprio_mllm.backends.protocol import BackendError, BackendSetupError, LostReplyError, UnreachableError
 
 __all__ = ["failure_of", "is_refusal"]
 
@@ -69,7 +69,7 @@ def failure_of(error: openai.OpenAIError, timeout_s: float, retries: int) -> Bac
     if isinstance(cause, (httpx2.UnsupportedProtocol, httpx2.LocalProtocolError)):
         return BackendSetupError(f"cannot ask: {why}")
     if isinstance(cause, _UNSENT):
-        return BackendError(f"no connection after {_times(retries)}: {why}")
+        return UnreachableError(f"no connection after {_times(retries)}: {why}")
     if isinstance(error, openai.APITimeoutError):
         return LostReplyError(f"no reply within {timeout_s:g} s, after {_times(retries)}")
     return LostReplyError(f"the connection broke, after {_times(retries)}: {why}")

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from proprio_mllm.backends.protocol import Backend, BackendError, ChatReply, ChatRequest
+from proprio_mllm.backends.protocol import Backend, BackendError, BackendSetupError, ChatReply, ChatRequest
 from proprio_mllm.backends.replies import ReplyStore, question_of
 from proprio_mllm.backends.transcripts import main
 
@@ -102,15 +102,17 @@ class ReplayBackend:
 
         Raises:
             BackendError: when there is none; the message names the request.
+            BackendSetupError: when there is none to any request of this backend.
         """
         key, _ = question_of(self.identity, request)
         found = self._store.get(key)
         if found is None:
             asked = next((message.text for message in reversed(request.messages) if message.role == "user"), "")
             start = " ".join(asked.split())[:_SHOWN_CHARACTERS]
-            raise BackendError(
+            others = self._store.count(self.identity)
+            raise (BackendError if others else BackendSetupError)(
                 f"{self._store.path} holds no reply to the {request.purpose!r} request {key[:12]} that begins {start!r}"
-                f" (of its backend, {self.identity}, it holds {self._store.count(self.identity)})"
+                f" (of its backend, {self.identity}, it holds {others})"
             )
         return found
 

@@ -27,6 +27,10 @@ _FINISHED: Final[Mapping[str, FinishReason]] = {
     "recitation": "refusal",
     "prohibited_content": "refusal",
 }
+#: More tokens than any call has; a count above it makes no sense.
+_MOST_TOKENS: Final = 10**9
+#: Longest name of a model; it goes into every ledger line and table.
+_NAME_CHARACTERS: Final = 200
 #: Ends of replies that are neither whole nor cut at their limit.
 _BROKEN: Final = frozenset({"error", "abort"})
 
@@ -79,7 +83,7 @@ def read_completion(body: bytes, content_type: str | None) -> ChatReply:
         prompt_tokens=prompt_tokens,
         completion_tokens=completion_tokens,
         finish_reason="refusal" if choice.message.refusal else _FINISHED.get(finished, "stop"),
-        model=" ".join(name for name in (completion.model, completion.system_fingerprint) if name),
+        model=_name(" ".join(name for name in (completion.model, completion.system_fingerprint) if name)),
     )
 
 
@@ -90,11 +94,18 @@ def read_usage(usage: object) -> tuple[int, int]:
     prompt, written = usage.get("prompt_tokens"), usage.get("completion_tokens", 0)
     total = usage.get("total_tokens", 0)
     counts = [
-        count for count in (prompt, written, total) if isinstance(count, int) and not isinstance(count, bool) and count >= 0
+        count
+        for count in (prompt, written, total)
+        if isinstance(count, int) and not isinstance(count, bool) and 0 <= count <= _MOST_TOKENS
     ]
     if len(counts) < 3:
         return 0, 0
     return counts[0], max(counts[1], counts[2] - counts[0])
+
+
+def _name(text: str) -> str:
+    """A name in one line, without what a terminal would obey."""
+    return "".join(character for character in " ".join(text.split()) if character.isprintable())[:_NAME_CHARACTERS]
 
 
 def _text(body: bytes) -> str:

@@ -25,6 +25,7 @@ from proprio_mllm.backends.http_client import MAX_REPLY_BYTES, bounded_client
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import (
     BackendError,
+    BackendSetupError,
     ChatImage,
     ChatMessage,
     ChatReply,
@@ -52,7 +53,7 @@ class OpenAIChat:
         limit_bytes: longest reply that is read.
 
     Raises:
-        BackendSetupError: when there is no key, or no usable URL.
+        BackendSetupError: when there is no key, no usable URL, or the environment's proxy or certificates cannot be used.
     """
 
     def __init__(self, cfg: BackendConfig, limit_bytes: int = MAX_REPLY_BYTES) -> None:
@@ -65,7 +66,14 @@ class OpenAIChat:
         if url.startswith("http:") and not own_machine:
             logger.warning("backend %s: the key in %s is sent unencrypted", cfg.name, cfg.key_env)
         self._secret.guard()
-        http_client = bounded_client(cfg.timeout_s, own_machine, limit_bytes)
+        try:
+            http_client = bounded_client(cfg.timeout_s, own_machine, limit_bytes)
+        except (ImportError, OSError, ValueError) as error:
+            self._secret.release()
+            raise BackendSetupError(
+                f"backend {cfg.name}: HTTP cannot be used as the environment asks (proxies: *_PROXY; certificates: SSL_CERT_*):"
+                f" {type(error).__name__}: {error}"
+            ) from error
         self._client = openai.OpenAI(
             api_key=self._secret.reveal(),
             base_url=url,

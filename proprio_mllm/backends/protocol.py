@@ -27,6 +27,7 @@ __all__ = [
     "CostCapError",
     "FinishReason",
     "LostReplyError",
+    "UnreachableError",
 ]
 
 #: How a reply ended: by itself, cut off at `max_tokens`, or refused by the model or its filter.
@@ -43,6 +44,10 @@ class BackendSetupError(BackendError):
 
 class LostReplyError(BackendError):
     """A call that was sent and whose reply did not come whole, or made no sense: it may have been charged."""
+
+
+class UnreachableError(BackendError):
+    """A call that reached no server, all attempts of it: when none ever was answered, it may well be the wrong address."""
 
 
 class CostCapError(BackendError):

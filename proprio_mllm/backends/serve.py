@@ -88,8 +88,11 @@ def main(arguments: Sequence[str]) -> int:
             stack.callback(backend.close)
             name = Path(cfg.weights).resolve().name
             server = ChatServer(backend, name, cfg.port, cfg.constrained)
-        except (BackendSetupError, OSError) as error:
+        except BackendSetupError as error:
             sys.stderr.write(f"serve: {error}\n")
+            return 1
+        except OSError as error:
+            sys.stderr.write(f"serve: port {cfg.port} cannot be had: {error.strerror}; port=0 takes a free one\n")
             return 1
         stack.callback(server.server_close)
         sys.stdout.write(f"{server.url} answers as {name}: {backend.model} on {backend.device}\n")

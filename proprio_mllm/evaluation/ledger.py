@@ -8,6 +8,7 @@ but they do not count as done: they are run again.
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import json
 import os
 from collections.abc import Iterable, Mapping
@@ -15,7 +16,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from data.records import EpisodeRecord, FailureCategory, Outcome
+from configs.validate import ConfigError, build
+from data.records import EpisodeRecord, Outcome
 
 __all__ = ["LEDGER_VERSION", "EpisodeKey", "Ledger", "LedgerError", "key_of", "read_ledger", "scored"]
 
@@ -53,7 +55,7 @@ def from_json(raw: Mapping[str, Any]) -> EpisodeRecord:
     """Reads `to_json` back, and lines of version 1.
 
     Raises:
-        LedgerError: on another version, or missing or unknown fields.
+        LedgerError: on another version, missing or unknown fields, or a value of another type.
     """
     values = dict(raw)
     version = values.pop("version", None)
@@ -62,10 +64,10 @@ def from_json(raw: Mapping[str, Any]) -> EpisodeRecord:
     names = {f.name for f in dataclasses.fields(EpisodeRecord)} - (_SINCE_2 if version == 1 else frozenset())
     if set(values) != names:
         raise LedgerError(f"missing fields {sorted(names - set(values))}, unknown fields {sorted(set(values) - names)}")
-    values["outcome"] = Outcome(values["outcome"])
-    values["failure"] = None if values["failure"] is None else FailureCategory(values["failure"])
-    values["trace"], values["models"] = tuple(values["trace"]), tuple(values.get("models", ()))
-    return EpisodeRecord(**values)
+    try:
+        return build(EpisodeRecord, values)
+    except ConfigError as error:
+        raise LedgerError(str(error)) from error
 
 
 def read_ledger(path: Path) -> list[EpisodeRecord]:
@@ -96,22 +98,28 @@ def scored(records: Iterable[EpisodeRecord]) -> dict[EpisodeKey, EpisodeRecord]:
 
 
 class Ledger:
-    """Appends to a ledger file; one process writes.
+    """Appends to a ledger file; one process writes, and the system gives its lock back when it ends.
 
     Args:
         path: made with its folder when absent; a line that was cut short is removed.
+
+    Raises:
+        LedgerError: when another process writes it.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_file():
-            content = path.read_bytes()
-            whole = content.rfind(b"\n") + 1
-            if whole != len(content):
-                with path.open("r+b") as handle:
-                    handle.truncate(whole)
         self._handle = path.open("ab")
+        try:
+            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._handle.close()
+            raise LedgerError(f"{path} is being written by another process: the same command is running already") from None
+        content = path.read_bytes()
+        whole = content.rfind(b"\n") + 1
+        if whole != len(content):
+            self._handle.truncate(whole)
 
     def append(self, record: EpisodeRecord) -> None:
         """Writes one record and waits until it is on the disk."""

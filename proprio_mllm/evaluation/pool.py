@@ -40,16 +40,22 @@ class Worker(Protocol[J_contra, R_co]):
         ...
 
 
+_make: Callable[[], Any] | None = None
 _worker: Any = None
 
 
 def _start(make: Callable[[], Any]) -> None:
-    global _worker
+    global _make
     start_worker()
-    _worker = make()
+    _make = make
 
 
 def _do(job: Any) -> Any:
+    """Makes the worker with its first job: an error in an initializer would look like a process that died."""
+    global _worker
+    if _worker is None:
+        assert _make is not None
+        _worker = _make()
     return _worker(job)
 
 
@@ -76,6 +82,9 @@ def run_jobs(
         failed: whether a result is worth another attempt. Every attempt's result is given out.
         lost: the result of a job whose process died too often, with the reason.
         retries: further attempts per job.
+
+    Raises:
+        Exception: what `make` raises, wherever it runs; no job is to blame for it.
     """
     queue = [_Attempt(job) for job in jobs]
     if workers == 0:

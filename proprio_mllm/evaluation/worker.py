@@ -18,7 +18,7 @@ from configs.schema.backend import BackendConfig
 from configs.schema.eval import CHAT_KINDS, DifficultyName, PlannerConfig, StartName
 from configs.schema.robot import RobotConfig
 from data.records import EpisodeRecord, Outcome
-from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest, CostCapError
+from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest, CostCapError, UnreachableError
 from proprio_mllm.evaluation.batching import answer_all
 from proprio_mllm.evaluation.episode import (
     Ask,
@@ -280,6 +280,7 @@ class _Chats:
         assert setup.backend is not None
         self._setup, self._cfg = setup, setup.backend
         self._backend = make_backend(setup.backend, Path(setup.folder), setup.cap_usd)
+        self._answered = False
         self.stop = ""
 
     def planner(self) -> Planner:
@@ -292,12 +293,21 @@ class _Chats:
         return self._backend.identity
 
     def complete(self, request: ChatRequest) -> ChatReply:
-        """The backend's reply; what it says when it can answer no more is kept."""
+        """The backend's reply; what it says when it can answer no more is kept.
+
+        A server that is not reached before it has answered anything is taken for a wrong address; one that goes away later
+        may come back.
+        """
         try:
-            return self._backend.complete(request)
+            reply = self._backend.complete(request)
         except (BackendSetupError, CostCapError) as error:
             self.stop = str(error)
             raise
+        except UnreachableError as error:
+            self.stop = self.stop or ("" if self._answered else str(error))
+            raise
+        self._answered = self._answered or not reply.cached
+        return reply
 
     def close(self) -> None:
         """Closes the backend."""

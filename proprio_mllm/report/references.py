@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import json
+import logging
 from pathlib import Path
 from typing import Final
 
@@ -23,6 +24,8 @@ from sim.tasks.task import load_benchmark
 __all__ = ["read_certificates", "references_of"]
 
 CERTIFICATES_PATH: Final = Path(sim.tasks.__file__).parent / "certificates.jsonl"
+
+logger = logging.getLogger(__name__)
 
 #: (task, trial)
 Episode = tuple[str, int]
@@ -67,17 +70,24 @@ def _same_episodes(run: Run, other: Run) -> dict[Episode, EpisodeRecord]:
 
 
 def _beside(run: Run, **wanted: object) -> dict[Episode, EpisodeRecord]:
-    """Episodes of runs beside a run with these settings and its robot, start, seed and luck; the newest stand."""
+    """Episodes of runs beside a run with these settings and its robot, start, seed and luck; the newest stand.
+
+    A neighbour that cannot be read is passed by with a warning: it must not cost a finished run its report.
+    """
     same = ("robot", "start", "seed", "contingencies", "contingencies_hash")
     wanted |= {name: run.metadata.get(name) for name in same}
     found: dict[Episode, EpisodeRecord] = {}
     paths = sorted(run.folder.parent.glob("*/run.json"), key=lambda path: (path.stat().st_mtime, path.parent.name))
     for path in paths:
-        metadata = read_metadata(path.parent)
-        if path.parent != run.folder and all(metadata.get(name) == value for name, value in wanted.items()):
-            other = load_run(path.parent)
-            if other.robot_config == run.robot_config:
-                found |= _same_episodes(run, other)
+        try:
+            metadata = read_metadata(path.parent)
+            fits = path.parent != run.folder and all(metadata.get(name) == value for name, value in wanted.items())
+            other = load_run(path.parent) if fits else None
+        except (OSError, ValueError) as error:
+            logger.warning("left out as a reference: %s", error)
+            continue
+        if other is not None and other.robot_config == run.robot_config:
+            found |= _same_episodes(run, other)
     return found
 
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.ledger import read_ledger
@@ -14,6 +14,12 @@ from proprio_mllm.report.metrics import References
 from proprio_mllm.report.summary import CATEGORIES, Row, rows_of
 
 __all__ = ["Run", "find_runs", "load_run", "read_metadata"]
+
+#: What every report reads of `run.json`.
+_NEEDED: Final = (
+    "planner", "label", "privileged", "robot", "difficulty", "config_hash", "command", "weights", "weights_digest", "tasks",
+    "trials", "category", "limit", "start", "seed", "planned", "config",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,14 +93,21 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     """Contents of a run's `run.json`.
 
     Raises:
-        ValueError: when the folder holds no run, or one of an unknown version.
+        ValueError: when the folder holds no run, one of an unknown version, or one that is damaged; the message names the file.
     """
     path = folder / "run.json"
     if not path.is_file():
         raise ValueError(f"{folder}: no run here (run.json is missing)")
-    metadata = json.loads(path.read_text(encoding="utf-8"))
-    if metadata.get("version") != 1:
-        raise ValueError(f"{path}: run version {metadata.get('version')!r} is unknown; this code reads 1")
+    try:
+        metadata = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: not JSON ({error})") from error
+    version = metadata.get("version") if isinstance(metadata, dict) else None
+    if version != 1:
+        raise ValueError(f"{path}: run version {version!r} is unknown; this code reads 1")
+    missing = [name for name in _NEEDED if name not in metadata]
+    if missing:
+        raise ValueError(f"{path}: damaged, it lacks {', '.join(missing)}")
     return metadata
 
 

@@ -211,7 +211,8 @@ def test_replaying(path: Path) -> None:
     with pytest.raises(BackendError, match=message) as caught:
         replay.complete(ask("b\n" * 200, purpose="reflection"))
     assert len(str(caught.value)) < 400
-    with pytest.raises(BackendError, match="it holds 0"):
+    assert type(caught.value) is BackendError
+    with pytest.raises(BackendSetupError, match="it holds 0"):
         ReplayBackend("another", path).complete(ask("a"))
 
 

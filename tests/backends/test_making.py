@@ -15,7 +15,7 @@ import yaml
 
 from configs.compose import CONFIG_DIR
 from configs.schema.backend import BackendConfig
-from configs.validate import build
+from configs.validate import ConfigError, build
 from proprio_mllm.backends.cache import CachedBackend, ReplayBackend
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.making import SPENDING_FILE, make_backend
@@ -63,6 +63,12 @@ def test_gpt4o_needs_its_key(tmp_path: Path) -> None:
         make_backend(read(CONFIG_DIR / "backend" / "gpt4o.yaml"), tmp_path)
     with pytest.raises(BackendSetupError, match="GEMINI_API_KEY"):
         make_backend(read(CONFIG_DIR / "backend" / "gemini.yaml"), tmp_path)
+
+
+def test_a_key_in_place_of_its_variable_is_refused_and_not_shown() -> None:
+    with pytest.raises(ConfigError, match="key_env is the name of an environment variable") as caught:
+        read(CONFIG_DIR / "backend" / "gpt4o.yaml", key_env=KEY)
+    assert KEY not in str(caught.value)
 
 
 @pytest.fixture

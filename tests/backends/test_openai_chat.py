@@ -15,7 +15,15 @@ from pydantic import BaseModel
 
 from configs.schema.backend import BackendConfig
 from proprio_mllm.backends.openai_chat import OpenAIChat
-from proprio_mllm.backends.protocol import Backend, BackendError, BackendSetupError, ChatReply, ChatRequest, LostReplyError
+from proprio_mllm.backends.protocol import (
+    Backend,
+    BackendError,
+    BackendSetupError,
+    ChatReply,
+    ChatRequest,
+    LostReplyError,
+    UnreachableError,
+)
 from tests.backends.loopback import IMAGE, KEY, Handler, LoopbackServer, ask, completion
 
 
@@ -109,6 +117,7 @@ def test_ends_of_replies(cfg: BackendConfig, server: LoopbackServer, body: objec
         ({"prompt_tokens": "100", "completion_tokens": 1, "total_tokens": 101}, (0, 0)),
         ({"prompt_tokens": -1, "completion_tokens": 1, "total_tokens": 0}, (0, 0)),
         ({"prompt_tokens": 5, "completion_tokens": None, "total_tokens": 9}, (0, 0)),
+        ({"prompt_tokens": 10**400, "completion_tokens": 1, "total_tokens": 1}, (0, 0)),
         ({"prompt_tokens": 5, "completion_tokens": 2}, (5, 2)),
         ({"prompt_tokens": 5, "completion_tokens": 2, "total_tokens": 17}, (5, 12)),  # thoughts are in the total alone
     ],
@@ -206,6 +215,12 @@ def test_a_content_policy_is_a_refusal(cfg: BackendConfig, server: LoopbackServe
     assert dataclasses.replace(reply_of(cfg), latency_s=0.0) == ChatReply("", finish_reason="refusal", model="some-model")
 
 
+def test_a_model_name_is_one_short_line(cfg: BackendConfig, server: LoopbackServer) -> None:
+    server.answer = lambda handler: handler.send(200, completion(model="gpt\n\x1b[31m4" + "o" * 10**6))
+    name = reply_of(cfg).model
+    assert (name[:12], len(name)) == ("gpt [31m4ooo", 200)
+
+
 def test_429_then_a_reply(cfg: BackendConfig, server: LoopbackServer) -> None:
     server.answer = lambda h: h.fail(429, "Slow down") if len(server.asked) < 3 else h.send(200, completion("at last"))
     assert reply_of(cfg, retries=2).text == "at last"
@@ -267,7 +282,7 @@ def test_a_connection_cut_in_a_reply(cfg: BackendConfig, server: LoopbackServer)
 
 def test_nobody_listens(cfg: BackendConfig) -> None:
     error = error_of(cfg, base_url="http://127.0.0.1:1/v1")
-    assert type(error) is BackendError and "no connection after 1 attempt: ConnectError" in str(error)
+    assert type(error) is UnreachableError and "no connection after 1 attempt: ConnectError" in str(error)
 
 
 @pytest.mark.parametrize("status", [200, 500])
@@ -337,6 +352,13 @@ def test_a_proxy_of_the_environment_is_passed_by_on_this_machine(cfg: BackendCon
     monkeypatch.setenv("HTTP_PROXY", "http://127.0.0.1:1")
     monkeypatch.setenv("OPENAI_BASE_URL", "http://127.0.0.1:1/v1")
     assert reply_of(cfg).text == "Pick(left, Mug_1)"
+
+
+@pytest.mark.parametrize(("variable", "value"), [("ALL_PROXY", "socks4://127.0.0.1:9"), ("SSL_CERT_FILE", "/nowhere.pem")])
+def test_an_environment_that_cannot_be_used(cfg: BackendConfig, monkeypatch, variable: str, value: str) -> None:
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(BackendSetupError, match=r"backend tested: HTTP cannot be used as the environment asks .*: \w+Error: "):
+        OpenAIChat(dataclasses.replace(cfg, base_url="https://example.com/v1"))
 
 
 def test_missing_keys(cfg: BackendConfig, server: LoopbackServer, monkeypatch, caplog) -> None:

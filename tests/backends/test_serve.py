@@ -7,6 +7,7 @@ import contextlib
 import functools
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -96,3 +97,14 @@ def test_a_wrong_command_is_explained(argument: str, code: int, message: str, ca
     captured = capsys.readouterr()
     assert message in captured.err
     assert captured.out == ""
+
+
+def test_a_port_that_is_taken_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        try:
+            assert main([f"port={port}", "device=cpu"]) == 1
+        finally:
+            signal.signal(signal.SIGTERM, before)
+    assert f"serve: port {port} cannot be had: Address already in use; port=0 takes a free one" in capsys.readouterr().err

@@ -63,6 +63,7 @@ def test_every_yaml_composes(path: Path) -> None:
         ("train", "model.mpe.mode=none", r"model\.mpe: mode|model\.mpe\.mode: 'none' is not allowed; allowed: mrope"),
         ("eval", "planner=oracle", r"planner='oracle' is not allowed; allowed: base, dag_plan, expert"),
         ("eval", "robot=atlas", r"robot='atlas' is not allowed; allowed: h1, x1"),
+        ("eval", "backend=null", r"backend='null' is not allowed; allowed: gemini, gpt4o"),
         ("eval", "trials=0", r"trials 0 must be positive"),
         ("train", "alignment.mask=1.5", r"mask 1\.5 outside \[0, 1\]"),
         ("eval", "trials", r"override 'trials': expected key=value"),
@@ -71,11 +72,13 @@ def test_every_yaml_composes(path: Path) -> None:
         ("train", "selu.temperature=0", r"temperature 0\.0 must be positive"),
         ("train", "model.motion.window=128", r"window 128 must be at most 64"),
         ("eval", "planner.colour=red", r"planner\.colour: unknown key"),
+        ("eval", "experiment=main_table experiment.robots=[]", r"experiment: robots \(\) must name at least one"),
+        ("eval", "experiment=main_table experiment.difficulties=[]", r"difficulties \(\) must name at least one"),
     ],
 )
 def test_wrong_entries_stop_at_once(root: str, override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        build(ROOTS[root], compose(root, [override]))
+        build(ROOTS[root], compose(root, override.split()))
 
 
 def test_unknown_root() -> None:

@@ -19,7 +19,7 @@ from sim.tasks.task import write_tasks
 #: Answers by the request alone, a little later for some, so that threads overtake each other.
 SCRIPT = """
 import hashlib, json, time
-from proprio_mllm.backends.protocol import BackendError, BackendSetupError, ChatReply, CostCapError
+from proprio_mllm.backends.protocol import BackendError, BackendSetupError, ChatReply, CostCapError, UnreachableError
 
 calls = []
 
@@ -38,6 +38,15 @@ def dear(request):
 
 def keyless(request):
     raise BackendSetupError("script: the key is wrong")
+
+def nowhere(request):
+    raise UnreachableError("script: no connection")
+
+def gone(request):
+    if len(calls) == 3:
+        calls.append(0)
+        raise UnreachableError("script: no connection")
+    return answer(request)
 
 def flaky(request):
     calls.append(0)
@@ -115,6 +124,16 @@ def test_a_backend_that_no_repetition_mends_stops_the_run(cfg, session) -> None:
     assert stopped.stopped == "script: the key is wrong"
     assert not stopped.records
     assert not stopped.broken
+
+
+def test_a_server_that_was_never_reached_stops_the_run_and_one_that_goes_away_does_not(cfg, session) -> None:
+    stopped = run(cfg, session, backend=script(cfg, "nowhere"), threads=4)
+    assert stopped.stopped == "script: no connection"
+    assert not stopped.records
+    assert not stopped.broken
+    whole = run(cfg, session, backend=script(cfg, "gone"))
+    assert not whole.stopped
+    assert (len(whole.records), len(whole.broken)) == (9, 1)
 
 
 def test_an_outage_is_never_a_score(cfg, session) -> None:

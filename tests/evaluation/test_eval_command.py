@@ -67,3 +67,24 @@ def test_absent_weights(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> N
 def test_an_experiment_without_runs_prints_the_papers_rows(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert command.main(["experiment=main_table", f"output={tmp_path}"]) == 0
     assert "63.16" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("override", ["planner=random", "experiment=main_table"])
+def test_an_output_that_cannot_be_written_is_one_message(
+    override: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert command.main([override, "limit=1", "workers=0", f"output={tmp_path / 'file'}"]) == 1
+    assert f"eval.py: [Errno 20] Not a directory: '{tmp_path / 'file'}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [("{", "not JSON"), ("[]", "run version None is unknown"), ('{"version": 1}', "damaged, it lacks planner, label")],
+)
+def test_a_damaged_run_is_named(content: str, said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "eval" / "gpt4o-h1" / "run.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(content)
+    assert command.main(["experiment=main_table", f"output={tmp_path}"]) == 1
+    assert f"eval.py: {path}: {said}" in capsys.readouterr().err

@@ -42,8 +42,26 @@ def test_a_cut_line_is_dropped_and_overwritten(tmp_path, record) -> None:
     assert path.read_bytes() == whole * 2
 
 
+def test_two_writers_are_one_too_many(tmp_path, record) -> None:
+    path = tmp_path / "ledger.jsonl"
+    with Ledger(path) as ledger:
+        ledger.append(record)
+        with pytest.raises(LedgerError, match=r"ledger\.jsonl is being written by another process"):
+            Ledger(path)
+    Ledger(path).close()
+    assert read_ledger(path) == [record]
+
+
 @pytest.mark.parametrize(
-    ("change", "message"), [({"version": 9}, "version 9"), ({"steps2": 1}, "steps2"), ({"outcome": "won"}, "won")]
+    ("change", "message"),
+    [
+        ({"version": 9}, "version 9"),
+        ({"steps2": 1}, "steps2"),
+        ({"outcome": "won"}, "won"),
+        ({"planner_tokens": None}, "planner_tokens: expected int, got None"),
+        ({"steps": "7"}, "steps: expected int, got '7'"),
+        ({"trace": ["Done()"]}, r"trace\[0\]: expected a mapping, got 'Done\(\)'"),
+    ],
 )
 def test_refuses_what_it_does_not_know(tmp_path, record, change, message) -> None:
     path = tmp_path / "ledger.jsonl"

@@ -7,6 +7,7 @@ import operator
 import os
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
+from typing import Any
 
 import pytest
 
@@ -14,6 +15,7 @@ from proprio_mllm.evaluation import pool
 from proprio_mllm.evaluation.pool import run_jobs
 
 ADD = functools.partial(functools.partial, operator.add, 1)
+REFUSED: Any = functools.partial(int, "no number")
 EXIT = functools.partial(functools.partial, os._exit)
 
 
@@ -66,3 +68,9 @@ def test_a_dying_process_is_replaced_and_the_job_given_up_after_its_retries() ->
 
     assert list(run_jobs(EXIT, [3], 1, lambda r: False, lose, retries=1)) == ["lost"]
     assert lost == [(3, "the worker process died in 2 attempts")]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_worker_that_cannot_be_made_ends_the_jobs_with_its_own_error(workers: int) -> None:
+    with pytest.raises(ValueError, match="'no number'"):
+        list(run_jobs(REFUSED, [1, 2, 3], workers, lambda r: False, lambda job, why: -1))

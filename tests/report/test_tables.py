@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from pathlib import Path
 
 import pytest
 import yaml
@@ -202,3 +203,14 @@ def test_copy_of_the_papers_tables_is_whole() -> None:
 
     raw = yaml.safe_load((Path(paper.__file__).parent / "paper_tables.yaml").read_text())
     assert raw["protocol"]["tasks"] == raw["protocol"]["essential"] + raw["protocol"]["optional"] + raw["protocol"]["single"]
+
+
+def test_a_damaged_neighbour_does_not_cost_a_run_its_report(tmp_path: Path, run, caplog: pytest.LogCaptureFixture) -> None:
+    folder = run(tmp_path)
+    other, expert = run(tmp_path, "scripted"), run(tmp_path, "expert")
+    (other / "run.json").write_text("{")
+    (expert / "ledger.jsonl").write_text("{}\n")
+    write_report(load_run(folder))
+    assert (folder / "summary.json").is_file()
+    assert f"left out as a reference: {other / 'run.json'}: not JSON" in caplog.text
+    assert f"left out as a reference: {expert / 'ledger.jsonl'}, line 1" in caplog.text

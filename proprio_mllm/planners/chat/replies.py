@@ -17,8 +17,9 @@ from proprio_mllm.backends.protocol import ChatReply
 __all__ = ["Plan", "Reflection", "ReplyError", "read_json", "read_reply", "read_steps"]
 
 T = TypeVar("T", bound=BaseModel)
-#: Longest reply that is searched for JSON, characters.
+#: Longest reply that is searched for JSON, characters, and most places in it that are tried.
 _LONGEST = 200_000
+_TRIED = 1000
 
 
 class ReplyError(ValueError):
@@ -73,12 +74,15 @@ def read_json(text: str) -> object:
     """
     decoder = json.JSONDecoder()
     text = text[:_LONGEST]
-    start = text.find("{")
-    while start >= 0:
+    start = -1
+    for _ in range(_TRIED):
+        start = text.find("{", start + 1)
+        if start < 0:
+            break
         try:
             return decoder.raw_decode(text, start)[0]
-        except (json.JSONDecodeError, RecursionError):
-            start = text.find("{", start + 1)
+        except (ValueError, RecursionError):  # not JSON, or a number of more digits than Python reads
+            continue
     raise ReplyError(f"no JSON object in {_short(text)}")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from proprio_mllm.backends.protocol import ChatReply
@@ -42,6 +44,18 @@ def test_each_wrong_reply_has_its_name(reply: ChatReply, message: str) -> None:
 def test_deep_nesting_is_an_error_and_not_a_crash() -> None:
     with pytest.raises(ReplyError, match="no JSON object"):
         read_json('{"a":' * 3000 + "1")
+
+
+def test_a_number_too_long_to_read_is_a_wrong_reply() -> None:
+    with pytest.raises(ReplyError, match="no JSON object"):
+        read_json('{"steps": ["Done()"], "n": ' + "9" * 5000 + "}")
+
+
+def test_a_reply_of_braces_alone_is_soon_given_up() -> None:
+    before = time.process_time()
+    with pytest.raises(ReplyError, match="no JSON object"):
+        read_json("{" * 200_000)
+    assert time.process_time() - before < 2.0
 
 
 def test_steps_are_read_up_to_the_limit() -> None:
