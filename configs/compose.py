@@ -6,6 +6,7 @@ wrong group value or key stops here with the allowed ones; a wrong value of a pl
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from configs.assets import own_files
 from configs.validate import ConfigError
@@ -97,6 +98,8 @@ def _check_groups(overrides: Sequence[str]) -> None:
 
 
 def _explain(error: Exception, root: str, overrides: Sequence[str]) -> str:
+    if isinstance(error, MissingMandatoryValue) and error.full_key:
+        return _missing(str(error.full_key), overrides)
     GlobalHydra.instance().clear()
     with initialize_config_dir(config_dir=str(CONFIG_DIR), version_base=None):
         try:
@@ -105,6 +108,8 @@ def _explain(error: Exception, root: str, overrides: Sequence[str]) -> str:
             return f"configs/{root}.yaml does not compose: {_first_line(error)}"
     for override in overrides:
         key = override.partition("=")[0].lstrip("+~")
+        if key in groups():
+            continue
         node: Any = config
         path: list[str] = []
         for part in key.split("."):
@@ -114,6 +119,20 @@ def _explain(error: Exception, root: str, overrides: Sequence[str]) -> str:
             path.append(part)
             node = node[part] if not OmegaConf.is_missing(node, part) else None
     return _first_line(error)
+
+
+def _missing(key: str, overrides: Sequence[str]) -> str:
+    """What to give for a value that a group's file leaves to the user, in the words of that file's first line."""
+    group = key.partition(".")[0]
+    given = dict(override.lstrip("+").partition("=")[::2] for override in overrides)
+    chosen = given.get(group, "")
+    if not chosen and group == "backend":  # then the planner's file chooses it
+        own = CONFIG_DIR / "planner" / f"{given.get('planner', '')}.yaml"
+        found = re.search(r"/backend@\S+: (\w+)", own.read_text(encoding="utf-8")) if own.is_file() else None
+        chosen = found[1] if found else ""
+    path = CONFIG_DIR / group / f"{chosen}.yaml"
+    about = path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("#").strip() if path.is_file() else ""
+    return f"{key} has no value; set {key}=…{f' ({chosen}: {about})' if about else ''}"
 
 
 def _first_line(error: Exception) -> str:

@@ -19,6 +19,8 @@ from configs.compose import CONFIG_DIR, compose, groups
 __all__ = ["asks_for_help", "help_text"]
 
 _WIDTH: Final = 110
+#: Stands for a field that has no default.
+_UNSET: Final = object()
 _ENTRY: Final = re.compile(r"^(\w+(?:, \w+)*): (.*)$")
 
 
@@ -56,17 +58,24 @@ def _fields(schema: type, values: Mapping[str, Any], prefix: str) -> Iterator[tu
     """Name, default and meaning of every field; fields of nested configurations follow theirs."""
     meanings, kinds = _meanings(schema), typing.get_type_hints(schema)
     for field in dataclasses.fields(schema):
-        value = values.get(field.name)
+        value = values.get(field.name, _default(field))
         meaning = meanings.get(field.name, "")
-        if isinstance(value, Mapping):
-            nested = next((kind for kind in (kinds[field.name], *typing.get_args(kinds[field.name])) if _is_schema(kind)), None)
-            if nested is not None:
-                yield from _fields(nested, value, f"{prefix}{field.name}.")
-                continue
+        nested = next((kind for kind in (kinds[field.name], *typing.get_args(kinds[field.name])) if _is_schema(kind)), None)
+        if nested is not None and isinstance(value, Mapping):
+            yield from _fields(nested, value, f"{prefix}{field.name}.")
+            continue
         allowed = typing.get_args(kinds[field.name]) if typing.get_origin(kinds[field.name]) is typing.Literal else ()
         if allowed:
             meaning = f"{meaning.rstrip('.')} [{', '.join(map(str, allowed))}]"
         yield prefix + field.name, _shown(value), meaning.strip()
+        if nested is not None and value is None:  # a group that is not chosen; its fields as its files leave them
+            yield from _fields(nested, {}, f"{prefix}{field.name}.")
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return _UNSET if field.default is dataclasses.MISSING else field.default
 
 
 def _is_schema(kind: object) -> bool:
@@ -74,6 +83,8 @@ def _is_schema(kind: object) -> bool:
 
 
 def _shown(value: object) -> str:
+    if value is _UNSET:
+        return "…"
     if value is None or value == "":
         return "null" if value is None else "''"
     if isinstance(value, bool):

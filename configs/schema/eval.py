@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -29,6 +31,17 @@ StartName = Literal["fixed", "turned", "random"]
 PlannerKind = Literal["mllm", "file", "random", "scripted", "expert", "plain", "llm_planner", "rap", "dag_plan"]
 #: Kinds that ask a language model in chats, and so need a backend.
 CHAT_KINDS: Final[tuple[PlannerKind, ...]] = ("plain", "llm_planner", "rap", "dag_plan")
+#: Fields of a planner that not every kind uses; elsewhere they keep their defaults, so that none is ignored.
+_OF_KINDS: Final[Mapping[str, tuple[PlannerKind, ...]]] = {
+    "adapter": ("mllm",),
+    "temperature": ("mllm",),
+    "max_new_tokens": ("mllm",),
+    "replans": CHAT_KINDS,
+    "history": CHAT_KINDS,
+    "body": CHAT_KINDS,
+    "horizon": ("plain",),
+    "parallel": ("dag_plan",),
+}
 ExperimentName = Literal["main_table", "ablation_table", "replanning_table", "failure_figure", "distribution_figures"]
 
 
@@ -95,7 +108,12 @@ class PlannerConfig:
         needs = self.kind in ("llm_planner", "rap")
         _require((self.memory is not None) == needs, f"kind {self.kind!r} with memory {self.memory!r}")
         _require((self.examples > 0) == needs, f"kind {self.kind!r} with examples {self.examples}")
-        _require(self.parallel or self.kind == "dag_plan", f"kind {self.kind!r} with parallel {self.parallel}; allowed: True")
+        for name, kinds in _OF_KINDS.items():
+            default = self.__dataclass_fields__[name].default
+            _require(
+                self.kind in kinds or getattr(self, name) == default,
+                f"kind {self.kind!r} with {name} {getattr(self, name)!r}; allowed: {default!r}, others with {', '.join(kinds)}",
+            )
 
 
 @dataclass(frozen=True)
@@ -193,6 +211,11 @@ class EvalConfig:
             f"reflection {self.reflection!r} with planner kind {self.planner.kind!r}, which has none; allowed: on",
         )
         _require(self.backend is not None or not chats, f"planner {self.planner.name!r} needs a backend, got null")
+        _require(
+            self.backend is None or chats,
+            f"backend {self.backend.name if self.backend else ''!r} with planner kind {self.planner.kind!r}, which asks none; "
+            f"allowed: null, or a planner of kind {', '.join(CHAT_KINDS)}",
+        )
         _require(1 <= self.threads <= 256, f"threads {self.threads} outside [1, 256]")
         _require(
             self.threads == 1 or (chats and self.workers == 0),
@@ -204,7 +227,8 @@ class EvalConfig:
             self.workers == 0 or not local,
             f"workers {self.workers} with a model in this process; allowed: workers=0, with threads=N for N episodes at once",
         )
-        _require(self.cost_cap_usd is None or self.cost_cap_usd >= 0.0, f"cost_cap_usd {self.cost_cap_usd} is negative")
+        cap = self.cost_cap_usd
+        _require(cap is None or 0.0 <= cap < math.inf, f"cost_cap_usd {cap} must be null or a finite number of at least 0")
         _require(self.limit is None or self.limit > 0, f"limit {self.limit} must be positive or null")
         _require(self.retries >= 0, f"retries {self.retries} must not be negative")
         _require(self.seed >= 0, f"seed {self.seed} must not be negative")

@@ -24,6 +24,7 @@ from proprio_mllm.backends.transcripts import main
 __all__ = ["CachedBackend", "ReplayBackend"]
 
 _SHOWN_CHARACTERS: Final = 80
+_SHOWN_OTHERS: Final = 5
 
 logger = logging.getLogger(__name__)
 
@@ -110,9 +111,10 @@ class ReplayBackend:
             asked = next((message.text for message in reversed(request.messages) if message.role == "user"), "")
             start = " ".join(asked.split())[:_SHOWN_CHARACTERS]
             others = self._store.count(self.identity)
+            held = "" if others else "; it holds replies of: " + (", ".join(self._store.identities()[:_SHOWN_OTHERS]) or "none")
             raise (BackendError if others else BackendSetupError)(
                 f"{self._store.path} holds no reply to the {request.purpose!r} request {key[:12]} that begins {start!r}"
-                f" (of its backend, {self.identity}, it holds {others})"
+                f" (of its backend, {self.identity}, it holds {others}{held})"
             )
         return found
 

@@ -9,6 +9,8 @@ Format: OpenAI's API reference, object `chat.completion`. Paper: none (engineeri
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -27,6 +29,7 @@ _FINISHED: Final[Mapping[str, FinishReason]] = {
     "recitation": "refusal",
     "prohibited_content": "refusal",
 }
+_SURROGATE: Final = re.compile(rb"\\u[dD][89a-fA-F]")
 #: More tokens than any call has; a count above it makes no sense.
 _MOST_TOKENS: Final = 10**9
 #: Longest name of a model; it goes into every ledger line and table.
@@ -35,14 +38,26 @@ _NAME_CHARACTERS: Final = 200
 _BROKEN: Final = frozenset({"error", "abort"})
 
 
+class _Part(BaseModel):
+    type: str = "text"
+    text: str = ""
+
+
 class _Message(BaseModel):
-    content: str | None = None
+    content: str | list[_Part] | None = None
     refusal: str | None = None
+
+    @property
+    def text(self) -> str:
+        """The content; of parts, as some servers send, the texts among them."""
+        if isinstance(self.content, list):
+            return "".join(part.text for part in self.content if part.type == "text")
+        return self.content or ""
 
 
 class _Choice(BaseModel):
     message: _Message
-    finish_reason: str | None = None
+    finish_reason: Any = None
 
 
 class _Completion(BaseModel):
@@ -66,7 +81,7 @@ def read_completion(body: bytes, content_type: str | None) -> ChatReply:
     if kind != "application/json" and not kind.endswith("+json"):
         raise LostReplyError(f"the reply is {kind!r}, not JSON: {_text(body)}")
     try:
-        completion = _Completion.model_validate_json(body)
+        completion = _Completion.model_validate_json(_whole(body))
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         where = ".".join(map(str, first["loc"]))
@@ -74,12 +89,12 @@ def read_completion(body: bytes, content_type: str | None) -> ChatReply:
             f"the reply is no chat completion: {where + ': ' if where else ''}{first['msg']}: {_text(body)}"
         ) from None
     choice = completion.choices[0]
-    finished = (choice.finish_reason or "stop").lower()
+    finished = str(choice.finish_reason or "stop").lower()
     if finished in _BROKEN:
         raise LostReplyError(f"the reply broke off with finish_reason {finished!r}")
     prompt_tokens, completion_tokens = read_usage(completion.usage)
     return ChatReply(
-        text=choice.message.content or choice.message.refusal or "",
+        text=choice.message.text or choice.message.refusal or "",
         prompt_tokens=prompt_tokens,
         completion_tokens=completion_tokens,
         finish_reason="refusal" if choice.message.refusal else _FINISHED.get(finished, "stop"),
@@ -101,6 +116,16 @@ def read_usage(usage: object) -> tuple[int, int]:
     if len(counts) < 3:
         return 0, 0
     return counts[0], max(counts[1], counts[2] - counts[0])
+
+
+def _whole(body: bytes) -> bytes:
+    """A body without halves of surrogate pairs, which a reply that was cut inside a character can spell and UTF-8 cannot."""
+    if _SURROGATE.search(body) is None:
+        return body
+    try:
+        return json.dumps(json.loads(body), ensure_ascii=False).encode(errors="replace")
+    except (ValueError, RecursionError):
+        return body  # no JSON; the parser below says why
 
 
 def _name(text: str) -> str:

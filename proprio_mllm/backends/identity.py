@@ -18,8 +18,8 @@ def identity_of(cfg: BackendConfig) -> str:
     """Canonical JSON of model, revision and what is fixed in the configuration; the rest is in every request.
 
     Of a scripted backend it is the digest of its file, which has to be loaded. A local checkpoint is known by the folder's path
-    and `revision`, for which `LocalChat` takes the checkpoint's fingerprint when none is given; replaying such a run needs it,
-    `backend.revision=…` as the ledger's `models` show it.
+    and `revision`, for which `LocalChat` takes the checkpoint's fingerprint when none is given, and runs what the server of
+    this project tells of its model; replaying such a run needs it, `backend.revision=…` as the ledger's `models` show it.
     """
     if cfg.source is not None:
         return _canonical({"script": source_digest(cfg.source)})

@@ -59,6 +59,7 @@ class LocalChat:
         )
         #: Model and revision, as replies name them.
         self.model = f"{checkpoint.folder.resolve().name}@{revision}"
+        self.revision = revision
         #: As recorded replies are known: without a revision of the configuration, they belong to this fingerprint.
         self.identity = identity_of(dataclasses.replace(cfg, revision=revision))
         #: Where it runs and with how many tokens of prompt and reply together, for people.

@@ -20,7 +20,7 @@ from proprio_mllm.backends.scripted import ScriptedChat
 from proprio_mllm.backends.slots import Slots, SlottedBackend
 from proprio_mllm.backends.spending import Spending, SpendingBackend
 
-__all__ = ["SPENDING_FILE", "check_cap", "make_backend"]
+__all__ = ["SPENDING_FILE", "check_cap", "make_backend", "told_revision"]
 
 #: In a run's folder.
 SPENDING_FILE: Final = "spending.sqlite"
@@ -45,7 +45,7 @@ def make_backend(cfg: BackendConfig, run: Path | None, cap_usd: float | None = N
         assert cfg.cache is not None
         return ReplayBackend(identity_of(cfg), Path(cfg.cache))
     if cap_usd is not None and run is None:
-        raise ValueError(f"cap_usd {cap_usd} cannot be held without a run's folder")
+        raise ValueError(f"cost_cap_usd {cap_usd} cannot be held without a run's folder")
     check_cap(cfg, cap_usd)
     price = None if cfg.price is None else price_of(cfg.price)
     if price is not None and cfg.model not in price.models:
@@ -62,6 +62,23 @@ def make_backend(cfg: BackendConfig, run: Path | None, cap_usd: float | None = N
         raise
 
 
+def told_revision(cfg: BackendConfig) -> str:
+    """The revision that a server of this machine tells of its model; "" for what is not asked, or tells none.
+
+    Raises:
+        BackendSetupError: when the backend cannot be made.
+    """
+    if cfg.kind != "openai" or cfg.base_url is None or not on_this_machine(cfg.base_url):
+        return ""
+    from proprio_mllm.backends.openai_chat import OpenAIChat
+
+    chat = OpenAIChat(cfg)
+    try:
+        return chat.revision()
+    finally:
+        chat.close()
+
+
 def check_cap(cfg: BackendConfig, cap_usd: float | None) -> None:
     """Whether a cap can be held.
 
@@ -72,7 +89,7 @@ def check_cap(cfg: BackendConfig, cap_usd: float | None) -> None:
         return
     free = cfg.kind != "openai" or (cfg.base_url is not None and on_this_machine(cfg.base_url))
     if cfg.price is None and not free:
-        raise ValueError(f"cap_usd {cap_usd} cannot be held: backend.price of {cfg.name} is null")
+        raise ValueError(f"cost_cap_usd {cap_usd} cannot be held: backend.price of {cfg.name} is null")
 
 
 def _model(cfg: BackendConfig) -> Backend:

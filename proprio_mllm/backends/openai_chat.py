@@ -31,6 +31,7 @@ from proprio_mllm.backends.protocol import (
     ChatReply,
     ChatRequest,
     LostReplyError,
+    UnreachableError,
 )
 from proprio_mllm.backends.secret import read_secret
 from proprio_mllm.backends.structured import strict_schema
@@ -41,6 +42,7 @@ __all__ = ["OPENAI_URL", "OpenAIChat"]
 OPENAI_URL: Final = "https://api.openai.com/v1"
 
 _SHOWN_CHARACTERS: Final = 400
+_LIST_TIMEOUT_S: Final = 5.0
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +60,7 @@ class OpenAIChat:
 
     def __init__(self, cfg: BackendConfig, limit_bytes: int = MAX_REPLY_BYTES) -> None:
         url = checked_url(cfg.base_url or OPENAI_URL, cfg.name)
-        own_machine = on_this_machine(url)
+        self._own_machine = own_machine = on_this_machine(url)
         self.identity = identity_of(cfg)
         self._cfg = cfg
         self._limit_bytes = limit_bytes
@@ -97,11 +99,27 @@ class OpenAIChat:
         reply = self._asked(body)
         latency_s = time.perf_counter() - start
         if isinstance(reply, BackendError):  # raised out here, so that no error of the client hangs on it
-            raise type(reply)(f"backend {self._cfg.name}: {_shortened(self._secret.redact(str(reply)))}")
+            where = f"{self._client.base_url}: " if isinstance(reply, UnreachableError) else ""
+            hint = "; `make serve` starts this project's server" if where and self._own_machine else ""
+            raise type(reply)(f"backend {self._cfg.name}: {where}{_shortened(self._secret.redact(str(reply)))}{hint}")
         if reply.prompt_tokens == 0 and reply.finish_reason != "refusal":
             logger.warning("backend %s: a reply without usable token counts", self._cfg.name)
         text, model = self._secret.redact(reply.text), self._secret.redact(reply.model)
         return dataclasses.replace(reply, text=text, model=model, latency_s=latency_s)
+
+    def revision(self) -> str:
+        """Revision of the model as the server's list of models tells it; "" when it tells none or cannot be asked.
+
+        OpenAI's format has no such field. The server of this project tells it, so that its replies are known by the weights.
+        """
+        try:
+            listed = self._client.with_options(timeout=_LIST_TIMEOUT_S, max_retries=0).models.list()
+            cards = [card for card in listed.data if card.id == self._cfg.model]
+            told = (cards[0].model_extra or {}).get("revision") if cards else None
+        except (openai.OpenAIError, AttributeError, TypeError) as error:
+            logger.debug("backend %s: no list of models: %s", self._cfg.name, self._secret.redact(str(error)))
+            return ""
+        return self._secret.redact(told)[:_SHOWN_CHARACTERS] if isinstance(told, str) else ""
 
     def close(self) -> None:
         """Closes its connections."""

@@ -208,6 +208,14 @@ class ReplyStore:
             0
         ]
 
+    def identities(self) -> list[str]:
+        """The backends whose replies it holds, those of the newest replies first."""
+        rows = self._database.rows(
+            "SELECT json_extract(question, '$.identity') AS one, MAX(rowid) AS newest FROM replies"
+            " GROUP BY one ORDER BY newest DESC"
+        )
+        return [str(identity) for identity, _ in rows]
+
     def close(self) -> None:
         """Closes the file."""
         self._database.close()

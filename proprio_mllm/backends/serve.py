@@ -87,7 +87,7 @@ def main(arguments: Sequence[str]) -> int:
             backend = LocalChat(cfg.backend())
             stack.callback(backend.close)
             name = Path(cfg.weights).resolve().name
-            server = ChatServer(backend, name, cfg.port, cfg.constrained)
+            server = ChatServer(backend, name, cfg.port, cfg.constrained, backend.revision)
         except BackendSetupError as error:
             sys.stderr.write(f"serve: {error}\n")
             return 1

@@ -37,6 +37,7 @@ class ChatServer(ThreadingHTTPServer):
         name: of the model, as clients ask for it.
         port: 0 takes a free one; `url` names it.
         constrained: whether the backend holds replies to a schema.
+        revision: of the model, told in the list of models; "" tells none.
 
     Raises:
         OSError: when the port is taken.
@@ -45,9 +46,9 @@ class ChatServer(ThreadingHTTPServer):
     # Threads are waited for when the server closes, so that calls under way get their replies.
     daemon_threads = False
 
-    def __init__(self, backend: Backend, name: str, port: int, constrained: bool = False) -> None:
+    def __init__(self, backend: Backend, name: str, port: int, constrained: bool = False, revision: str = "") -> None:
         super().__init__(("127.0.0.1", port), _Handler)
-        self.backend, self.name, self.constrained = backend, name, constrained
+        self.backend, self.name, self.constrained, self.revision = backend, name, constrained, revision
         self.since = int(time.time())
 
     @property
@@ -103,7 +104,7 @@ class _Handler(BaseHTTPRequestHandler):
         server = self.server
         assert isinstance(server, ChatServer)
         if path == _MODELS:
-            return model_list(server.name, server.since)
+            return model_list(server.name, server.since, server.revision)
         return completion(server.backend.complete(read_request(self._body(), server.name, server.constrained)), server.name)
 
     def _body(self) -> bytes:

@@ -55,7 +55,7 @@ class Spending:
 
     def __init__(self, path: Path, cap_usd: float | None) -> None:
         if cap_usd is not None and not cap_usd >= 0.0:
-            raise ValueError(f"cap_usd {cap_usd} must not be negative")
+            raise ValueError(f"cost_cap_usd {cap_usd} must not be negative")
         self.cap_usd = cap_usd
         self._database = Database(path, _TABLES)
 
@@ -72,7 +72,7 @@ class Spending:
             if self.cap_usd is not None and spent + bound_usd > self.cap_usd:
                 raise CostCapError(
                     f"backend {backend}: a call of up to {bound_usd:.4f} USD might pass the cap:"
-                    f" {spent:.4f} of {self.cap_usd:.4f} USD are spent or booked"
+                    f" {spent:.4f} of {self.cap_usd:.4f} USD are spent or booked; a higher cost_cap_usd goes on from here"
                 )
             connection.execute("UPDATE total SET usd = usd + ?", (bound_usd,))
             values = (now, backend, purpose, bound_usd)

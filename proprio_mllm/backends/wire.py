@@ -199,14 +199,16 @@ def completion(reply: ChatReply, model: str) -> dict[str, Any]:
     }
 
 
-def model_list(model: str, since: int) -> dict[str, Any]:
+def model_list(model: str, since: int, revision: str = "") -> dict[str, Any]:
     """The list of the one model.
 
     Args:
         model: its name.
         since: when it was loaded, in seconds of Unix time.
+        revision: which weights these are; OpenAI's format has no such field, clients that do not know it pass over it.
     """
-    return {"object": "list", "data": [{"id": model, "object": "model", "created": since, "owned_by": "local"}]}
+    card = {"id": model, "object": "model", "created": since, "owned_by": "local"}
+    return {"object": "list", "data": [card | ({"revision": revision} if revision else {})]}
 
 
 def error_object(message: str, status: int, code: str | None = None) -> dict[str, Any]:

@@ -29,10 +29,11 @@ from data.code_files import source_digest, split_source
 from data.files import file_hash, write_text
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.backends.identity import identity_of
-from proprio_mllm.backends.making import check_cap, make_backend
+from proprio_mllm.backends.making import check_cap, make_backend, told_revision
 from proprio_mllm.evaluation.batching import batch_planner
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
 from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledger, scored
+from proprio_mllm.evaluation.naming import options_of
 from proprio_mllm.evaluation.scheduling import scheduled
 from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, Opener, WorkerSetup
@@ -162,25 +163,8 @@ def plan_episodes(cfg: EvalConfig, tasks: Sequence[Task], digest: str) -> list[E
 
 def run_folder(cfg: EvalConfig, digest: str) -> Path:
     """Where a run's files go; equal commands share a folder, other weights or settings have their own."""
-    parts = [cfg.planner.name, cfg.robot.name, cfg.difficulty]
-    if cfg.category != "all":
-        parts.append(cfg.category)
-    if cfg.trials != 1:
-        parts.append(f"trials{cfg.trials}")
-    if cfg.limit is not None:
-        parts.append(f"limit{cfg.limit}")
-    if cfg.contingencies != "default":
-        parts.append(cfg.contingencies)
-    if cfg.start != "fixed":
-        parts.append(cfg.start)
-    if cfg.split != "all":
-        parts.append(cfg.split)
-    if cfg.planner.reflection == "off":
-        parts.append("no_reflection")
-    if cfg.seed != 0:
-        parts.append(f"seed{cfg.seed}")
-    if cfg.tasks != "benchmark":
-        parts.append(Path(cfg.tasks).stem)
+    own = dict.fromkeys([cfg.planner.name, cfg.planner.name if cfg.backend is None else cfg.backend.name])
+    parts = [*own, cfg.robot.name, cfg.difficulty, *options_of(dataclasses.asdict(cfg))]
     return Path(cfg.output) / "eval" / "-".join([*parts, config_hash(cfg, digest)[:6]])
 
 
@@ -254,6 +238,7 @@ def _ready(cfg: EvalConfig) -> EvalConfig:
             backend, model=str(found(backend.model)), revision=backend.revision or checkpoint.fingerprint()
         )
     else:
+        backend = dataclasses.replace(backend, revision=backend.revision or told_revision(backend))
         make_backend(backend, None).close()
     return dataclasses.replace(cfg, backend=backend)
 

@@ -129,9 +129,15 @@ def _compared(kind: str, a: Run, b: Run, differing: list[str]) -> RunComparison:
     order = [*(name for name in CATEGORIES if name in found), *sorted(found - set(CATEGORIES))]
     rows = {category: _figures([pair for pair in pairs if pair[0].category == category]) for category in order}
     names = tuple(
-        {"label": str(run.metadata["label"]), "robot": str(run.metadata["robot"]), "folder": str(run.folder)} for run in (a, b)
+        {"label": _label(run, than), "robot": str(run.metadata["robot"]), "folder": str(run.folder)}
+        for run, than in ((a, b), (b, a))
     )
     return RunComparison(kind, (names[0], names[1]), rows | {"all": _figures(pairs)}, pairs, len(planned) - len(pairs))
+
+
+def _label(run: Run, than: Run) -> str:
+    """A run's label, with what it did that the other did not."""
+    return ", ".join([str(run.metadata["label"]), *(option for option in run.options if option not in than.options)])
 
 
 def _figures(pairs: Sequence[Pair]) -> dict[str, Comparison]:

@@ -44,6 +44,7 @@ def run_digest(run: Run) -> dict[str, Any]:
     ledger = run.folder / "ledger.jsonl"
     return {
         "name": run.folder.resolve().name,
+        "title": run.title,
         **{name: run.metadata.get(name) for name in _PROVENANCE},
         "planned": len(run.metadata["planned"]),
         "scored": len(run.records),

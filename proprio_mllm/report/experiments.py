@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import yaml
 
-from configs.compose import CONFIG_DIR
+from configs.compose import CONFIG_DIR, groups
 from configs.schema.eval import CHAT_KINDS, ExperimentConfig
 from data.files import write_text
 from proprio_mllm.report.figures import distribution_figures, failure_figure
@@ -26,6 +26,8 @@ _CATEGORIES: Final = ("essential", "optional", "single")
 _PAPER_NOTE: Final = "paper: printed in the paper, another simulator and a 7B model; not comparable in size, shown apart."
 
 
+#: A model and its cells: the run to show, if there is one, and the category.
+_Row = tuple[str | None, list[tuple[Run | None, str]]]
 _COSTS: Final = ("invalid %", "broken", "calls", "tokens", "USD", "model")
 
 
@@ -90,6 +92,11 @@ def _rate(run: Run | None, category: str) -> str:
     return rate_cell(row) if row.episodes == planned else f"{rate_cell(row)} of {planned}"
 
 
+def _filled(rows: Sequence[_Row]) -> Sequence[_Row]:
+    """The models of a planner with a run to show; of a planner without any, one empty row in its own name."""
+    return [row for row in rows if any(run is not None for run, _ in row[1])] or [(None, rows[0][1])]
+
+
 def _own_row(title: str, cells: Sequence[tuple[Run | None, str]]) -> tuple[str, ...]:
     """A row of ours from (run, category) per cell."""
     shown = [run for run, _ in cells if run is not None]
@@ -107,9 +114,11 @@ def main_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
     difficulty, paper = cfg.difficulties[0], dict(paper_main())
     body: list[tuple[str, ...]] = []
     for name in cfg.planners:
-        for model in _models(runs, name):
-            cells = [(newest(runs, name, robot, difficulty, category, model=model), category) for category, robot in places]
-            body.append(_own_row(_title(name, model), cells))
+        rows = [
+            (model, [(newest(runs, name, robot, difficulty, category, model=model), category) for category, robot in places])
+            for model in _models(runs, name)
+        ]
+        body += [_own_row(_title(name, model), cells) for model, cells in _filled(rows)]
         method = PAPER_ROWS.get(name, (None, None, None))[0]
         if method is not None:
             body.append(_paper_row(method, paper.pop(method), places))
@@ -132,12 +141,17 @@ def replanning_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
         method = PAPER_ROWS.get(name, (None, None, None))[1]
         reflects = _planner(name).get("kind") in ("mllm", *CHAT_KINDS)
         for reflection, suffix in (("on", ""), ("off", " without reflection"))[: 2 if reflects else 1]:
-            for model in _models(runs, name):
-                cells = [
-                    (newest(runs, name, robot, difficulty, "essential", reflection, model), "essential")
-                    for difficulty in cfg.difficulties
-                ]
-                body.append(_own_row(f"{_title(name, model)}{suffix}", cells))
+            rows = [
+                (
+                    model,
+                    [
+                        (newest(runs, name, robot, difficulty, "essential", reflection, model), "essential")
+                        for difficulty in cfg.difficulties
+                    ],
+                )
+                for model in _models(runs, name)
+            ]
+            body += [_own_row(f"{_title(name, model)}{suffix}", cells) for model, cells in _filled(rows)]
             values = paper.pop(f"{method}{suffix}", None)
             if values is not None:
                 body.append(_paper_row(f"{method}{suffix}", values, cfg.difficulties))
@@ -145,7 +159,7 @@ def replanning_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
     columns = ("planner", "source", *cfg.difficulties, *_COSTS)
     notes = (
         "Low-level skills succeed in 100 % (easy), 50 % (medium), 20 % (hard) of the cases. Without reflection: see "
-        "docs/evaluation.md for what each planner then leaves out.",
+        "docs/planners.md for what each planner then leaves out.",
         _PAPER_NOTE,
     )
     return Table(f"Re-planning, dual-arm essential, {robot}", columns, tuple(body), notes)
@@ -193,10 +207,17 @@ def assemble(cfg: ExperimentConfig, output: Path) -> tuple[Table | None, list[Pa
 
     Returns:
         The table, None for a figure; and the files that were written.
+
+    Raises:
+        ValueError: when a planner is named that does not exist and has no run.
     """
     folder = output / "experiments"
     folder.mkdir(parents=True, exist_ok=True)
     runs = find_runs(output)
+    known = {*groups()["planner"], *(str(run.metadata["planner"]) for run in runs)}
+    unknown = [name for name in cfg.planners if name not in known]
+    if unknown:
+        raise ValueError(f"experiment.planners: {unknown[0]!r} is no planner and no run's; allowed: {', '.join(sorted(known))}")
     if cfg.name in _FIGURES:
         return None, _FIGURES[cfg.name](cfg, runs, folder)
     table = _TABLES[cfg.name](cfg, runs)

@@ -142,7 +142,7 @@ def page(runs: Sequence[RunData]) -> str:
         lstrip_blocks=True,
     )  # fmt: skip
     environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False, "separators": (",", ":"), "allow_nan": False}
-    names = [f"{run.about['label']} · {run.about['robot']} · {run.about['difficulty']}" for run in runs]
+    names = [str(run.about["title"]) for run in runs]
     return environment.get_template("page.html.jinja").render(
         title=names[0] if len(names) == 1 else f"{len(names)} runs",
         names=names,

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from data.files import write_text
+from proprio_mllm.backends.making import SPENDING_FILE
+from proprio_mllm.backends.spending import Spending
 from proprio_mllm.report.references import references_of
 from proprio_mllm.report.stored import Run, find_runs, load_run
 from proprio_mllm.report.summary import SUMMARY_VERSION, Row, write_json
@@ -18,7 +21,7 @@ def run_notes(run: Run) -> list[str]:
     notes = []
     missing = len(run.metadata["planned"]) - len(run.records)
     if missing:
-        notes.append(f"{missing} of {len(run.metadata['planned'])} episodes have no score; run the same command again.")
+        notes.append(f"{missing} of {len(run.metadata['planned'])} episodes have no score; the same command goes on with them.")
     if run.broken:
         notes.append(f"{len(run.broken)} attempts broke for reasons outside the planner; they are not scored.")
     if run.machinery:
@@ -28,9 +31,23 @@ def run_notes(run: Run) -> list[str]:
         spent = "an unknown price" if None in priced else f"{sum(filter(None, priced)):.4f} USD when they were made"
         calls, cached = sum(r.planner_calls for r in run.records), sum(r.cached_calls for r in run.records)
         notes.append(f"{calls} calls of {run.model or 'a model'}, {cached} of them from the cache, at {spent}.")
+        notes += _paid(run.folder / SPENDING_FILE)
     if run.metadata["privileged"]:
         notes.append("Privileged: this planner looks into the simulator's state.")
     return notes
+
+
+def _paid(path: Path) -> list[str]:
+    """What the run's own calls have cost, those of broken and unfinished episodes included."""
+    if not path.is_file():
+        return []
+    spending = Spending(path, None)
+    try:
+        total, unknown = spending.total_usd(), spending.open_usd()
+    finally:
+        spending.close()
+    lost = f", {unknown:.4f} of it booked for calls whose reply never came" if unknown else ""
+    return [f"This run has paid {total:.4f} USD so far, broken and unfinished episodes included{lost}."] if total else []
 
 
 def run_report(run: Run, rows: Sequence[Row] | None = None) -> Table:
@@ -40,10 +57,9 @@ def run_report(run: Run, rows: Sequence[Row] | None = None) -> Table:
         run: the run.
         rows: its rows when they have been made already.
     """
-    meta = run.metadata
     if rows is None:
         rows = run.rows(references_of(run))
-    return run_table(f"{meta['label']} · {meta['robot']} · {meta['difficulty']}", rows, run_notes(run))
+    return run_table(run.title, rows, run_notes(run))
 
 
 def write_report(run: Run) -> Table:

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.ledger import read_ledger
+from proprio_mllm.evaluation.naming import options_of
 from proprio_mllm.report.metrics import References
 from proprio_mllm.report.summary import CATEGORIES, Row, rows_of
 
@@ -52,6 +53,17 @@ class Run:
     def backend(self) -> Mapping[str, Any]:
         """The backend's configuration; empty for a run without one."""
         return self.metadata.get("backend") or {}
+
+    @property
+    def title(self) -> str:
+        """Planner, robot, difficulty, and what it did otherwise than the plain command."""
+        meta = self.metadata
+        return " · ".join([meta["label"], meta["robot"], meta["difficulty"], *self.options])
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """What it did otherwise than the plain command."""
+        return tuple(option.replace("_", " ") for option in options_of(self.metadata["config"]))
 
     @property
     def machinery(self) -> bool:

@@ -103,7 +103,7 @@ def main(arguments: Sequence[str]) -> int:
     except ValueError as error:
         sys.stderr.write(f"strip: {error}\n")
         return 2
-    title = f"{run.metadata['label']} · {record.robot} · {task} · {record.outcome.value}"
+    title = f"{run.title} · {task} · {record.outcome.value}"
     out = Path(options.get("out", str(folder / f"strip-{task}-{trial}.png")))
     sys.stdout.write(f"{draw_strip(frames, title, out)}\n")
     return 0

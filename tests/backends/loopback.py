@@ -39,6 +39,9 @@ class Handler(BaseHTTPRequestHandler):
     disable_nagle_algorithm = True  # or every answer waits 40 ms for an acknowledgement
     server: LoopbackServer
 
+    def do_GET(self) -> None:
+        self.server.answer(self)
+
     def do_POST(self) -> None:
         body = self.rfile.read(int(self.headers["Content-Length"]))
         with self.server.lock:

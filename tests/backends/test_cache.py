@@ -212,7 +212,7 @@ def test_replaying(path: Path) -> None:
         replay.complete(ask("b\n" * 200, purpose="reflection"))
     assert len(str(caught.value)) < 400
     assert type(caught.value) is BackendError
-    with pytest.raises(BackendSetupError, match="it holds 0"):
+    with pytest.raises(BackendSetupError, match="it holds 0; it holds replies of: answering"):
         ReplayBackend("another", path).complete(ask("a"))
 
 

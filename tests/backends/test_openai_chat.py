@@ -142,7 +142,7 @@ def test_usage(cfg: BackendConfig, server: LoopbackServer, usage: object, tokens
         (
             completion(message={"content": 5}),
             "application/json",
-            r"choices\.0\.message\.content: Input should be a valid string",
+            r"choices\.0\.message\.content.str: Input should be a valid string",
         ),
         (b'{"choices": [{"message": {"content": "\xff"}}]}', "application/json", "no chat completion: Invalid JSON"),
         (completion("half", finish_reason="error"), "application/json", "broke off with finish_reason 'error'"),
@@ -282,7 +282,38 @@ def test_a_connection_cut_in_a_reply(cfg: BackendConfig, server: LoopbackServer)
 
 def test_nobody_listens(cfg: BackendConfig) -> None:
     error = error_of(cfg, base_url="http://127.0.0.1:1/v1")
-    assert type(error) is UnreachableError and "no connection after 1 attempt: ConnectError" in str(error)
+    assert type(error) is UnreachableError
+    assert "http://127.0.0.1:1/v1/: no connection after 1 attempt: ConnectError" in str(error)
+    assert str(error).endswith("; `make serve` starts this project's server")
+
+
+@pytest.mark.parametrize(
+    ("status", "body", "revision"),
+    [
+        (200, {"object": "list", "data": [{"id": "other", "revision": "b"}, {"id": "served-model", "revision": "a1"}]}, "a1"),
+        (200, {"object": "list", "data": [{"id": "other", "revision": "b"}]}, ""),
+        (200, {"object": "list", "data": [{"id": "served-model"}]}, ""),
+        (200, {"object": "list", "data": [{"id": "served-model", "revision": 3}]}, ""),
+        (200, {"object": "list", "data": []}, ""),
+        (200, {"data": None}, ""),
+        (200, ["what"], ""),
+        (200, "no JSON", ""),
+        (404, {"error": "no such path"}, ""),
+    ],
+)
+def test_the_revision_that_a_server_tells(
+    cfg: BackendConfig, server: LoopbackServer, status: int, body: object, revision: str
+) -> None:
+    server.answer = lambda handler: handler.send(status, body)
+    backend = OpenAIChat(dataclasses.replace(cfg, model="served-model"))
+    assert backend.revision() == revision
+    backend.close()
+
+
+def test_nobody_tells_a_revision(cfg: BackendConfig) -> None:
+    backend = OpenAIChat(dataclasses.replace(cfg, base_url="http://127.0.0.1:1/v1"))
+    assert backend.revision() == ""
+    backend.close()
 
 
 @pytest.mark.parametrize("status", [200, 500])

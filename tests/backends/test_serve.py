@@ -60,7 +60,8 @@ def test_the_tiny_model_is_served(view: Callable[..., ChatImage]) -> None:
         parts: Any = [{"type": "image_url", "image_url": {"url": picture}}, {"type": "text", "text": "left?"}]
         with openai.OpenAI(base_url=url, api_key="none", max_retries=0, timeout=60) as client:
             chat = functools.partial(client.chat.completions.create, model="base", temperature=0)
-            assert [model.id for model in client.models.list()] == ["base"]
+            (card,) = client.models.list()
+            assert (card.id, f"base@{(card.model_extra or {})['revision']}") == ("base", said.split()[3])
             seen = chat(messages=[{"role": "system", "content": "look"}, {"role": "user", "content": parts}], max_tokens=20)
             text = chat(messages=[{"role": "user", "content": "left?"}], max_tokens=1)
             with pytest.raises(openai.BadRequestError, match="the model's context of 4096"):

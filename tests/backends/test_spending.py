@@ -66,7 +66,9 @@ def test_a_call_that_might_pass_the_cap_is_not_made(path: Path) -> None:
     inner = Answering(reply=lambda request: ChatReply("ok", 50, 2))
     backend = SpendingBackend(inner, PRICE, Spending(path, 10.0), "tested")
     backend.complete(ask(max_tokens=10))
-    message = r"backend tested: a call of up to 9\.0000 USD might pass the cap: 2\.0000 of 10\.0000 USD are spent or booked"
+    message = (
+        r"backend tested: a call of up to 9\.0000 USD might pass the cap: 2\.0000 of 10\.0000 USD are spent or booked; a higher"
+    )
     with pytest.raises(CostCapError, match=message):
         backend.complete(ask(max_tokens=9))
     assert len(inner.asked) == 1

@@ -51,7 +51,8 @@ def test_every_yaml_composes(path: Path) -> None:
         load_contingency(name)
         return
     root = GROUP_ROOT[group]
-    build(ROOTS[root], compose(root, [f"{group}={name}", *NEEDS.get(f"{group}/{name}", NEEDS.get(name, ()))]))
+    planner = ["planner=dag_plan"] if group == "backend" else []
+    build(ROOTS[root], compose(root, [*planner, f"{group}={name}", *NEEDS.get(f"{group}/{name}", NEEDS.get(name, ()))]))
 
 
 @pytest.mark.parametrize(
@@ -64,6 +65,13 @@ def test_every_yaml_composes(path: Path) -> None:
         ("eval", "planner=oracle", r"planner='oracle' is not allowed; allowed: base, dag_plan, expert"),
         ("eval", "robot=atlas", r"robot='atlas' is not allowed; allowed: h1, x1"),
         ("eval", "backend=null", r"backend='null' is not allowed; allowed: gemini, gpt4o"),
+        ("eval", "backend=vllm", r"backend\.model has no value; set backend\.model=… \(vllm: .*give the name"),
+        ("eval", "planner=qwen2_5_vl", r"backend\.model has no value; set .* \(qwen2_5_vl: .*backend\.model=FOLDER"),
+        ("eval", "backend=serve", r"backend 'serve' with planner kind 'mllm', which asks none; allowed: null, or a planner of"),
+        ("eval", "planner.horizon=2", r"kind 'mllm' with horizon 2; allowed: 1, others with plain"),
+        ("eval", "planner.body=true", r"kind 'mllm' with body True; allowed: False, others with plain, llm_planner"),
+        ("eval", "cost_cap_usd=nan", r"cost_cap_usd nan must be null or a finite number of at least 0"),
+        ("eval", "cost_cap_usd=-1", r"cost_cap_usd -1\.0 must be null or a finite number"),
         ("eval", "trials=0", r"trials 0 must be positive"),
         ("train", "alignment.mask=1.5", r"mask 1\.5 outside \[0, 1\]"),
         ("eval", "trials", r"override 'trials': expected key=value"),

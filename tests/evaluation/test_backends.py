@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import threading
 from pathlib import Path
 
 import pytest
@@ -12,8 +13,9 @@ from configs.schema.backend import BackendConfig
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
 from data.records import EpisodeRecord, Outcome
-from proprio_mllm.backends.protocol import BackendSetupError
-from proprio_mllm.evaluation.run import evaluate
+from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest
+from proprio_mllm.backends.server import ChatServer
+from proprio_mllm.evaluation.run import _ready, evaluate, run_folder
 from sim.tasks.task import write_tasks
 
 #: Answers by the request alone, a little later for some, so that threads overtake each other.
@@ -159,3 +161,35 @@ def test_what_was_run_and_what_it_cost_is_in_the_metadata(cfg, session) -> None:
     assert stored["backend"]["name"] == "script"
     assert stored["reflection"] == "on"
     assert run(cfg, session, backend=script(cfg, "flaky")).folder != result.folder
+    assert result.folder.name.startswith("gpt4o-script-h1-easy-tasks-")
+    told = dataclasses.replace(cfg.planner, body=True, horizon=2, reflection="off")
+    assert "-easy-no_reflection-body-horizon2-tasks-" in run_folder(dataclasses.replace(cfg, planner=told), "").name
+
+
+class Silent:
+    """Never asked: it only has a name."""
+
+    identity = "silent"
+
+    def complete(self, request: ChatRequest) -> ChatReply:
+        raise AssertionError(request)
+
+    def close(self) -> None:
+        pass
+
+
+def test_other_weights_behind_a_server_are_another_run(cfg, tmp_path) -> None:
+    folders, told = [], []
+    asked = BackendConfig("openai", "serve", model="base", cache=str(tmp_path / "replies.sqlite"), retries=0)
+    for revision in ("one", "two", "two", ""):
+        with ChatServer(Silent(), "base", 0, revision=revision) as server:
+            thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+            thread.start()
+            backend = _ready(dataclasses.replace(cfg, backend=dataclasses.replace(asked, base_url=server.url))).backend
+            server.shutdown()
+            thread.join(30)
+        assert backend is not None
+        told.append(backend.revision)
+        folders.append(run_folder(dataclasses.replace(cfg, backend=backend), ""))
+    assert told == ["one", "two", "two", ""]
+    assert folders[0] != folders[1] == folders[2] != folders[3]

@@ -25,7 +25,7 @@ TINY = Path(__file__).resolve().parents[2] / "weights/tiny/base"
 @pytest.fixture(scope="module")
 def url() -> Iterator[str]:
     chat = LocalChat(BackendConfig("local", "served", model=str(TINY), device="cpu", batch=4, cache=None))
-    server = ChatServer(chat, "base", 0, False)
+    server = ChatServer(chat, "base", 0, False, chat.revision)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield server.url
     server.shutdown()
@@ -54,7 +54,9 @@ def test_a_planner_asks_the_served_model_and_repeats_the_run_without_it(
     assert all(record.planner_calls > 0 and record.planner_tokens > 1000 for record in first.records)
     assert {model.partition("@")[0].split()[0] for record in first.records for model in record.models} == {"base"}
     assert cfg.backend is not None
-    nowhere = dataclasses.replace(cfg.backend, kind="replay", base_url="http://127.0.0.1:9/v1")
+    revision = first.metadata["backend"]["revision"]
+    assert all(model.endswith(f"@{revision}") for record in first.records for model in record.models)
+    nowhere = dataclasses.replace(cfg.backend, kind="replay", base_url="http://127.0.0.1:9/v1", revision=revision)
     again = evaluate(dataclasses.replace(cfg, backend=nowhere, output=str(tmp_path / "b"), threads=1))
     for record, replayed in zip(first.records, again.records, strict=True):
         assert replayed.cached_calls == replayed.planner_calls

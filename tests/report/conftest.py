@@ -74,7 +74,9 @@ def store_run(folder: Path, records: list[EpisodeRecord], **change: object) -> P
     return folder
 
 
-def make_run(output: Path, planner: str = "random", robot: str = "h1", difficulty: str = "easy", seed: int = 0) -> Path:
+def make_run(
+    output: Path, planner: str = "random", robot: str = "h1", difficulty: str = "easy", seed: int = 0, **change: object
+) -> Path:
     rng = np.random.default_rng(seed)
     folder = output / "eval" / f"{planner}-{robot}-{difficulty}"
     kinds = list(FailureCategory)
@@ -84,7 +86,7 @@ def make_run(output: Path, planner: str = "random", robot: str = "h1", difficult
         failure = None if success else kinds[int(rng.integers(3))]
         own = {"planner": planner, "robot": robot, "difficulty": difficulty, "failure": failure}
         records.append(make_record(f"t{i}", CATEGORIES[i % 3], success, **own))
-    return store_run(folder, records)
+    return store_run(folder, records, **change)
 
 
 @pytest.fixture

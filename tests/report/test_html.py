@@ -104,7 +104,7 @@ def test_equal_runs_give_equal_pages_and_several_fit_on_one(run: Path, tmp_path:
     both = Page(page([data, data]))
     assert [one["run"] for one in both.data("listed")] == [0, 0, 0, 1, 1, 1]
     assert main([str(run), str(run), f"out={tmp_path}/new/two.html", "frames=none"]) == 0
-    assert Page((tmp_path / "new" / "two.html").read_text()).data("names") == ["Random · x1 · easy"] * 2
+    assert Page((tmp_path / "new" / "two.html").read_text()).data("names") == ["Random · x1 · easy · tasks"] * 2
     assert main([str(run), "frames=none"]) == 0
     assert (run / "report.html").is_file()
 

@@ -13,10 +13,11 @@ from rich.console import Console
 
 from configs.schema.eval import ExperimentConfig
 from data.records import FailureCategory, Outcome
+from proprio_mllm.backends.spending import Spending
 from proprio_mllm.evaluation.ledger import Ledger
 from proprio_mllm.report import paper
 from proprio_mllm.report.experiments import EXPERIMENTS, ablation_table, assemble, main_table, replanning_table
-from proprio_mllm.report.runs import find_runs, load_run, newest, write_report
+from proprio_mllm.report.runs import find_runs, load_run, newest, run_notes, run_report, write_report
 from proprio_mllm.report.statistics import wilson
 from proprio_mllm.report.summary import rows_of
 from proprio_mllm.report.table import Table, rate_cell, run_table
@@ -153,6 +154,51 @@ def test_main_table_keeps_ours_and_the_papers_apart(tmp_path, run) -> None:
     assert table.rows[0][table.columns.index("essential x1")] == ""  # not run
     assert set(table.rows[1][2:]) == {""}
     assert next(row for row in table.rows if row[:2] == ("Proprio-MLLM", "paper"))[column] == "63.16"
+
+
+def test_a_run_over_a_part_of_the_tasks_makes_no_row(tmp_path, run) -> None:
+    served = {"kind": "openai", "name": "serve", "model": "base"}
+    run(tmp_path / "a", "dag_plan", "h1", limit=3, backend=served)
+    table = main_table(ExperimentConfig("main_table", ("dag_plan",)), find_runs(tmp_path / "a"))
+    assert [row[0] for row in table.rows if row[1] == "ours"] == ["DAG-Plan"]
+    run(tmp_path / "b", "dag_plan", "h1", backend=served)
+    table = main_table(ExperimentConfig("main_table", ("dag_plan",)), find_runs(tmp_path / "b"))
+    assert [row[0] for row in table.rows if row[1] == "ours"] == ["DAG-Plan (base)"]
+
+
+def test_an_unknown_planner_is_named(tmp_path, run) -> None:
+    run(tmp_path, "mine", "h1")
+    assemble(ExperimentConfig("main_table", ("mine", "gpt4o")), tmp_path)
+    with pytest.raises(
+        ValueError, match=r"experiment\.planners: 'oracle' is no planner and no run's; allowed: base, dag_plan, "
+    ):
+        assemble(ExperimentConfig("main_table", ("mine", "oracle")), tmp_path)
+
+
+def test_what_a_run_does_otherwise_is_in_its_title(tmp_path, run) -> None:
+    config = {
+        "planner": {"reflection": "off", "body": True, "parallel": False},
+        "trials": 3,
+        "limit": 2,
+        "tasks": "a/own.jsonl",
+    }
+    folder = run(tmp_path, config=config)
+    assert load_run(folder).title.endswith(" · trials3 · limit2 · no reflection · body · one node · own")
+    assert run_report(load_run(folder)).title == load_run(folder).title
+
+
+def test_what_a_run_has_paid_counts_what_no_score_shows(tmp_path, run) -> None:
+    folder = run(tmp_path, backend={"kind": "openai", "name": "gpt4o", "model": "gpt-4o"})
+    assert not [note for note in run_notes(load_run(folder)) if "has paid" in note]
+    spending = Spending(folder / "spending.sqlite", None)
+    spending.settle(spending.book(0.5), 0.25)
+    spending.book(0.5)
+    spending.close()
+    (note,) = [note for note in run_notes(load_run(folder)) if "has paid" in note]
+    assert note == (
+        "This run has paid 0.7500 USD so far, broken and unfinished episodes included, 0.5000 of it booked for calls whose "
+        "reply never came."
+    )
 
 
 def test_a_run_that_is_not_finished_says_so_in_every_table(tmp_path, run) -> None:
