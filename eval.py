@@ -36,7 +36,8 @@ def main(overrides: Sequence[str]) -> int:
         sys.stdout.write(help_text("eval", EvalConfig, __doc__ or ""))
         return 0
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    logging.getLogger("httpx2").setLevel(logging.WARNING)  # a line per call would drown the progress bar
+    for name in ("httpx2", "OpenGL"):  # a line per call would drown the progress bar; that acceleration is absent is no news
+        logging.getLogger(name).setLevel(logging.WARNING)
     console = Console(stderr=True, highlight=False)
     try:
         cfg = build(EvalConfig, compose("eval", overrides))

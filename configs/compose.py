@@ -124,7 +124,7 @@ def _explain(error: Exception, root: str, overrides: Sequence[str]) -> str:
 def _missing(key: str, overrides: Sequence[str]) -> str:
     """What to give for a value that a group's file leaves to the user, in the words of that file's first line."""
     group = key.partition(".")[0]
-    given = dict(override.lstrip("+").partition("=")[::2] for override in overrides)
+    given = {name.lstrip("+"): value for name, _, value in (override.partition("=") for override in overrides)}
     chosen = given.get(group, "")
     if not chosen and group == "backend":  # then the planner's file chooses it
         own = CONFIG_DIR / "planner" / f"{given.get('planner', '')}.yaml"

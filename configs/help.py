@@ -16,7 +16,7 @@ import yaml
 
 from configs.compose import CONFIG_DIR, compose, groups
 
-__all__ = ["asks_for_help", "help_text"]
+__all__ = ["asks_for_help", "help_text", "tool_help"]
 
 _WIDTH: Final = 110
 #: Stands for a field that has no default.
@@ -44,6 +44,19 @@ def help_text(root: str, schema: type, about: str) -> str:
         lines += _entry(name, ", ".join(groups()[name]), 2, 16)
     lines += ["", "Fields (`field=value`; of a group `group.field=value`) and their defaults:", ""]
     for name, default, meaning in _fields(schema, values, ""):
+        lines += _entry(f"{name}={default}", meaning, 2, 44)
+    return "\n".join(lines) + "\n"
+
+
+def tool_help(schema: type, about: str) -> str:
+    """What a command without groups takes.
+
+    Args:
+        schema: its configuration.
+        about: the command's own description.
+    """
+    lines = [*textwrap.dedent(about).strip().splitlines(), "", "Arguments (`key=value`) and their defaults:", ""]
+    for name, default, meaning in _fields(schema, {}, ""):
         lines += _entry(f"{name}={default}", meaning, 2, 44)
     return "\n".join(lines) + "\n"
 

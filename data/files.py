@@ -65,6 +65,7 @@ def write_text(path: Path, text: str) -> None:
 def new_folder(folder: Path) -> Iterator[Path]:
     """An empty folder to write to, which takes the place of `folder` when the block ends well.
 
+    Files get the rights that the folder has, since some writers (safetensors) make them readable to their owner alone.
     A folder cannot be replaced in one step: the old one is moved to `NAME.old` for the moment of the change, and is
     what is left after a stop in it.
     """
@@ -76,6 +77,10 @@ def new_folder(folder: Path) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(work)
         raise
+    rights = work.stat().st_mode & 0o666
+    for path in work.rglob("*"):
+        if path.is_file() and not path.is_symlink():
+            path.chmod(rights)
     if folder.exists():
         shutil.rmtree(old, ignore_errors=True)
         os.replace(folder, old)

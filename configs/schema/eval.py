@@ -36,10 +36,10 @@ _OF_KINDS: Final[Mapping[str, tuple[PlannerKind, ...]]] = {
     "adapter": ("mllm",),
     "temperature": ("mllm",),
     "max_new_tokens": ("mllm",),
-    "replans": CHAT_KINDS,
-    "history": CHAT_KINDS,
-    "body": CHAT_KINDS,
-    "horizon": ("plain",),
+    "replans": (*CHAT_KINDS, "file"),
+    "history": (*CHAT_KINDS, "file"),
+    "body": (*CHAT_KINDS, "file"),
+    "horizon": ("plain", "file"),
     "parallel": ("dag_plan",),
 }
 ExperimentName = Literal["main_table", "ablation_table", "replanning_table", "failure_figure", "distribution_figures"]
@@ -163,7 +163,7 @@ class EvalConfig:
         output: folder of all outputs.
         experiment: assemble this instead of running episodes.
         reflection: whether failures are reflected on; planners that can take it from here (`planner.reflection`).
-        backend: the language model that planners which chat ask; others have none.
+        backend: the language model that planners which chat ask, and a planner of a file that takes one; others have none.
         threads: episodes that go on at a time in one process (`workers=0`), each with a planner of its own whose calls wait
             in a thread; for planners that ask a backend.
         cost_cap_usd: most money a run may spend, over all its parts; null sets no limit.
@@ -202,27 +202,34 @@ class EvalConfig:
             f"ray_address {self.ray_address!r} needs scheduler=ray, got {self.scheduler!r}",
         )
         _require(
-            self.batch == 1 or self.planner.kind in ("mllm", "file"),
-            f"batch {self.batch} with planner kind {self.planner.kind!r}; allowed: mllm, or file with begin and step_batch",
+            self.batch == 1 or self.planner.kind == "mllm" or (self.planner.kind == "file" and self.backend is None),
+            f"batch {self.batch} with planner kind {self.planner.kind!r}; allowed: mllm, or file with begin and step_batch; a "
+            "backend has backend.batch",
         )
         chats = self.planner.kind in CHAT_KINDS
+        asks = chats or (self.planner.kind == "file" and self.backend is not None)
         _require(
-            self.reflection == "on" or chats or self.planner.kind == "mllm",
+            self.reflection == "on" or asks or self.planner.kind == "mllm",
             f"reflection {self.reflection!r} with planner kind {self.planner.kind!r}, which has none; allowed: on",
         )
         _require(self.backend is not None or not chats, f"planner {self.planner.name!r} needs a backend, got null")
         _require(
-            self.backend is None or chats,
+            self.backend is None or asks,
             f"backend {self.backend.name if self.backend else ''!r} with planner kind {self.planner.kind!r}, which asks none; "
-            f"allowed: null, or a planner of kind {', '.join(CHAT_KINDS)}",
+            f"allowed: null, or a planner of kind {', '.join(CHAT_KINDS)}, file",
         )
+        for name in ("replans", "history", "body", "horizon") if self.planner.kind == "file" and not asks else ():
+            value, default = getattr(self.planner, name), PlannerConfig.__dataclass_fields__[name].default
+            _require(
+                value == default, f"planner.{name} {value!r} with planner kind 'file' without a backend; allowed: {default!r}"
+            )
         _require(1 <= self.threads <= 256, f"threads {self.threads} outside [1, 256]")
         _require(
-            self.threads == 1 or (chats and self.workers == 0),
+            self.threads == 1 or (asks and self.workers == 0),
             f"threads {self.threads} with planner kind {self.planner.kind!r} and workers {self.workers}; "
-            f"allowed: {', '.join(CHAT_KINDS)} with workers=0",
+            f"allowed: planners that ask a backend, with workers=0",
         )
-        local = chats and self.backend is not None and self.backend.kind == "local"
+        local = self.backend is not None and self.backend.kind == "local"
         _require(
             self.workers == 0 or not local,
             f"workers {self.workers} with a model in this process; allowed: workers=0, with threads=N for N episodes at once",

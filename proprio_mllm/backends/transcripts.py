@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from rich.console import Console
 
+from configs.help import asks_for_help
 from proprio_mllm.backends.protocol import BackendError
 from proprio_mllm.backends.replies import RecordedCall, ReplyStore
 
@@ -22,6 +23,11 @@ __all__ = ["TRANSCRIPT_VERSION", "export_lines", "import_lines", "listing", "mai
 
 TRANSCRIPT_VERSION: Final = 1
 _USAGE: Final = "expected FILE [show=KEY] [export=FILE.jsonl] [import=FILE.jsonl]"
+_ABOUT: Final = """  FILE                what backend.cache names, such as outputs/replies.sqlite; alone: a line per call
+  show=KEY            one call in full; the first digits of its key do
+  export=FILE.jsonl   all calls as JSON lines
+  import=FILE.jsonl   takes such lines in; calls that are there already stay as they are
+"""
 _SHOWN_CHARACTERS: Final = 60
 
 
@@ -88,6 +94,9 @@ def import_lines(store: ReplyStore, path: Path) -> tuple[int, int]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; 0 on success, 2 on wrong arguments or files."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if asks_for_help(given):
+        sys.stdout.write(f"Recorded replies: {_USAGE}\n\n{_ABOUT}")
+        return 0
     try:
         path, options = _split(given)
         store = ReplyStore(path, read_only="import" not in options)
@@ -95,6 +104,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _run(store, options)
         finally:
             store.close()
+    except BrokenPipeError:  # the reader, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (BackendError, ValueError, OSError) as error:
         Console(stderr=True, highlight=False).print(f"cache: {error}", style="red", markup=False, soft_wrap=True)
         return 2

@@ -23,6 +23,7 @@ from typing import Any, Final
 from tqdm import tqdm
 
 import configs
+from configs.schema.backend import BackendConfig
 from configs.schema.eval import CHAT_KINDS, EvalConfig, PlannerConfig
 from data.cluster import import_ray
 from data.code_files import source_digest, split_source
@@ -30,6 +31,7 @@ from data.files import file_hash, write_text
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.making import check_cap, make_backend, told_revision
+from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest
 from proprio_mllm.evaluation.batching import batch_planner
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
 from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledger, scored
@@ -39,7 +41,7 @@ from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, Opener, WorkerSetup
 from proprio_mllm.planners.memory import MEMORY_FILE, check_memory
 from proprio_mllm.planners.protocol import check_weights
-from proprio_mllm.planners.registry import make_planner
+from proprio_mllm.planners.registry import make_chat_planner, make_planner
 from sim.contingency import load_contingency
 from sim.robots.spec import load_robot
 from sim.tasks.task import Task, load_benchmark, read_tasks
@@ -126,7 +128,7 @@ def config_hash(cfg: EvalConfig, digest: str) -> str:
             del planner[name]
     decides = {"planner": planner, "weights": digest, "robot": dataclasses.asdict(cfg.robot), "start": cfg.start}
     decides["contingencies"] = _contingencies_hash(cfg)
-    if cfg.backend is not None and cfg.planner.kind in CHAT_KINDS:
+    if cfg.backend is not None:
         own = {name: getattr(cfg.backend, name) for name in ("max_tokens", "temperature", "image_size")}
         decides["backend"] = own | {"identity": identity_of(cfg.backend)}
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]
@@ -204,13 +206,26 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileg
     }
 
 
-def _resolved(planner: PlannerConfig) -> tuple[PlannerConfig, str]:
+class _Unasked:
+    """A backend to make a planner with that is asked nothing yet."""
+
+    identity = "unasked"
+
+    def complete(self, request: ChatRequest) -> ChatReply:
+        raise BackendSetupError(f"a planner asks its backend before its first episode: {request.purpose}")
+
+    def close(self) -> None:
+        """Holds nothing."""
+
+
+def _resolved(planner: PlannerConfig, backend: BackendConfig | None) -> tuple[PlannerConfig, str]:
     """The planner with its weights or its file found, and their digest."""
     if planner.source is not None:
         file, name = split_source(planner.source, "planner.source", "class")
         source = f"{found(str(file)).absolute()}:{name}"
         planner = dataclasses.replace(planner, source=source)
-        make_planner(planner)  # fails here, with one message, rather than in every worker
+        # what is wrong fails here, with one message, rather than in every worker
+        _ = make_planner(planner) if backend is None else make_chat_planner(planner, backend, _Unasked())
         return planner, source_digest(source)
     if planner.memory is not None:
         memory = check_memory(found(planner.memory))
@@ -222,10 +237,10 @@ def _resolved(planner: PlannerConfig) -> tuple[PlannerConfig, str]:
 
 
 def _ready(cfg: EvalConfig) -> EvalConfig:
-    """The configuration with the backend that its planner asks, known to be there, and no other."""
+    """The configuration with the backend that its planner asks known to be there."""
     backend = cfg.backend
-    if backend is None or cfg.planner.kind not in CHAT_KINDS:
-        return dataclasses.replace(cfg, backend=None)
+    if backend is None:
+        return cfg
     if backend.source is not None:
         file, name = split_source(backend.source, "backend.source", "function")
         backend = dataclasses.replace(backend, source=f"{found(str(file)).absolute()}:{name}")
@@ -268,7 +283,7 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
         )
     load_robot(cfg.robot.spec or cfg.robot.name)  # a wrong description stops here, not in every episode
     cfg = _ready(cfg)
-    planner, digest = _resolved(cfg.planner)
+    planner, digest = _resolved(cfg.planner, cfg.backend)
     if cfg.scheduler == "ray":
         import_ray(cfg.ray_address)  # a missing extra stops here, before anything is written
     if cfg.batch > 1 and planner.kind == "file":

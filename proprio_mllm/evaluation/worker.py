@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from configs.schema.backend import BackendConfig
-from configs.schema.eval import CHAT_KINDS, DifficultyName, PlannerConfig, StartName
+from configs.schema.eval import DifficultyName, PlannerConfig, StartName
 from configs.schema.robot import RobotConfig
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest, CostCapError, UnreachableError
@@ -132,7 +132,7 @@ class EpisodeWorker:
         logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
         self.setup = setup
         self._opener = opener
-        self._chats = _Chats(setup) if setup.backend is not None and setup.planner.kind in CHAT_KINDS else None
+        self._chats = _Chats(setup) if setup.backend is not None else None
         self.planner = _planner(setup) if self._chats is None else self._chats.planner()
 
     def __call__(self, job: EpisodeJob) -> EpisodeResult:

@@ -1,7 +1,9 @@
 """A user's own planner: a class in a Python file, named `FILE.py:CLASS`.
 
-The class is made without arguments and is a `Planner`: `privileged = False`, `image_size`, `reset`, `step`. It sees what every
-planner sees, observations and feedback. The file runs with the rights of the user, as any script. Paper: none (engineering).
+The class is a `Planner`: `privileged = False`, `image_size`, `reset`, `step`. It is made without arguments or, in a run with a
+backend, as the planners of `chat` are: with that backend, whose replies are cached, priced and counted, and with `ChatOptions`.
+It sees what every planner sees, observations and feedback. The file runs with the rights of the user, as any script.
+Paper: none (engineering).
 """
 
 from __future__ import annotations
@@ -12,8 +14,12 @@ from proprio_mllm.planners.protocol import Planner
 __all__ = ["load_planner"]
 
 
-def load_planner(source: str) -> Planner:
+def load_planner(source: str, *given: object) -> Planner:
     """A new planner of a file's class. The file's folder can be imported from, as when Python runs a script.
+
+    Args:
+        source: `FILE.py:CLASS`.
+        given: what the class is made with.
 
     Raises:
         CodeFileError: when the file cannot be run, or has no such class, or the class is no planner.
@@ -21,9 +27,10 @@ def load_planner(source: str) -> Planner:
     path, _, name = source.rpartition(":")
     found = load_named(source, "planner.source", "class")
     try:
-        planner = found()
+        planner = found(*given)
     except Exception as error:
-        raise CodeFileError(f"{path}: {name}() failed: {type(error).__name__}: {error}") from error
+        call = f"{name}({'backend, options' if given else ''})"
+        raise CodeFileError(f"{path}: {call} failed: {type(error).__name__}: {error}") from error
     wanted = {"privileged": bool, "image_size": int}
     missing = [f"{key} ({kind.__name__})" for key, kind in wanted.items() if not isinstance(getattr(planner, key, None), kind)]
     missing += [f"{key}()" for key in ("reset", "step") if not callable(getattr(planner, key, None))]

@@ -1,6 +1,6 @@
 """All planners that need nothing but an observation, by kind. The privileged expert is made in `proprio_mllm.evaluation`.
 
-`PLANNERS` stand alone, `CHAT_PLANNERS` ask a backend.
+`PLANNERS` stand alone, `CHAT_PLANNERS` ask a backend; a planner of a file does either.
 """
 
 from __future__ import annotations
@@ -77,8 +77,12 @@ def make_chat_planner(cfg: PlannerConfig, backend_cfg: BackendConfig, backend: B
     """The configured planner on a backend.
 
     Raises:
+        CodeFileError: when the planner of a file cannot be made.
         ValueError: on a kind that asks no backend.
     """
+    options = ChatOptions.of(cfg, backend_cfg)
+    if cfg.source is not None:
+        return load_planner(cfg.source, backend, options)
     if cfg.kind not in CHAT_PLANNERS:
-        raise ValueError(f"planner kind {cfg.kind!r} asks no backend; allowed: {', '.join(CHAT_PLANNERS)}")
-    return CHAT_PLANNERS[cfg.kind](backend, ChatOptions.of(cfg, backend_cfg))
+        raise ValueError(f"planner kind {cfg.kind!r} asks no backend; allowed: {', '.join(CHAT_PLANNERS)}, file")
+    return CHAT_PLANNERS[cfg.kind](backend, options)

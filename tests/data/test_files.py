@@ -51,3 +51,12 @@ def test_leftovers_of_a_kill_are_not_mixed_in(tmp_path: Path) -> None:
     with new_folder(tmp_path / "model") as work:
         (work / "first").write_text("")
     assert [path.name for path in (tmp_path / "model").iterdir()] == ["first"]
+
+
+def test_files_of_a_new_folder_have_its_rights(tmp_path: Path) -> None:
+    with new_folder(tmp_path / "model") as work:
+        (work / "part").mkdir()
+        (work / "part/weights").write_text("w")
+        (work / "part/weights").chmod(0o600)
+    folder = tmp_path / "model"
+    assert (folder / "part/weights").stat().st_mode & 0o777 == folder.stat().st_mode & 0o666

@@ -12,6 +12,7 @@ import pytest
 from configs.schema.backend import BackendConfig
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
+from data.code_files import CodeFileError
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest
 from proprio_mllm.backends.server import ChatServer
@@ -32,6 +33,10 @@ def answer(request):
     time.sleep(number % 5 / 100)
     step = ("GoTo(Mug_1)", "MoveDown(0.2)", "Pick(left, Mug_1)", "walk")[number % 4]
     return ChatReply(json.dumps({"cause": "", "change": "", "steps": [step]}), 100, 10, model="script-1", cost_usd=0.25)
+
+def brief(request):
+    reply = answer(request)
+    return ChatReply(json.dumps({"step": json.loads(reply.text)["steps"][0]}), 50, 5, model="script-2", cost_usd=0.5)
 
 def dear(request):
     if len(calls) >= 6:
@@ -150,7 +155,7 @@ def test_an_outage_is_never_a_score(cfg, session) -> None:
 def test_a_backend_that_cannot_be_made_stops_before_anything_is_written(cfg, session, tmp_path) -> None:
     assert cfg.backend is not None
     wrong = dataclasses.replace(cfg.backend, source=f"{tmp_path / 'script.py'}:nothing")
-    with pytest.raises(BackendSetupError, match="has no function 'nothing'; it has: answer, dear"):
+    with pytest.raises(BackendSetupError, match="has no function 'nothing'; it has: answer, brief, dear"):
         run(cfg, session, backend=wrong)
     assert not (tmp_path / "out").exists()
 
@@ -164,6 +169,34 @@ def test_what_was_run_and_what_it_cost_is_in_the_metadata(cfg, session) -> None:
     assert result.folder.name.startswith("gpt4o-script-h1-easy-tasks-")
     told = dataclasses.replace(cfg.planner, body=True, horizon=2, reflection="off")
     assert "-easy-no_reflection-body-horizon2-tasks-" in run_folder(dataclasses.replace(cfg, planner=told), "").name
+
+
+OWN_PROMPT = Path(__file__).parents[2] / "examples" / "own_prompt.py"
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+def test_a_prompt_of_ones_own_asks_the_runs_backend(cfg, session, threads: int) -> None:
+    own = PlannerConfig("brief", "file", "Brief", source=f"{OWN_PROMPT}:Brief")
+    result = run(cfg, session, planner=own, backend=script(cfg, "brief"), threads=threads)
+    assert not result.broken
+    assert len(result.records) == 9
+    assert result.folder.name.startswith("brief-script-h1-easy-")
+    assert result.metadata["label"] == "Brief on script"
+    for record in result.records:
+        assert record.planner_calls == record.steps > 0, "one call per step"
+        assert (record.planner_tokens, record.planner_usd) == (55 * record.planner_calls, 0.5 * record.planner_calls)
+        assert record.models == ("script-2",)
+    assert any(record.invalid_output for record in result.records), "`walk` is no action"
+
+
+def test_a_planner_of_a_file_that_takes_no_backend_is_refused_with_one(cfg, session, tmp_path) -> None:
+    own = PlannerConfig("near", "file", "Near", source=f"{OWN_PROMPT.with_name('own_planner.py')}:Nearby")
+    with pytest.raises(CodeFileError, match=r"Nearby\(backend, options\) failed: TypeError"):
+        run(cfg, session, planner=own)
+    with pytest.raises(ValueError, match=r"planner\.body True with planner kind 'file' without a backend; allowed: False"):
+        dataclasses.replace(cfg, planner=dataclasses.replace(own, body=True), backend=None)
+    with pytest.raises(ValueError, match=r"batch 2 with planner kind 'file'"):
+        dataclasses.replace(cfg, planner=own, batch=2)
 
 
 class Silent:

@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from data.records import PlanStep
 from proprio_mllm.backends.protocol import Backend, ChatImage, ChatMessage, ChatRequest
 from proprio_mllm.planners.chat.replies import ReplyError, read_reply
-from proprio_mllm.planners.protocol import PlannerReply, Usage
+from proprio_mllm.planners.protocol import PlannerReply, Usage, parse_reply
 
 __all__ = ["REFLECTION", "Answer", "Asker"]
 
@@ -78,6 +78,11 @@ class Asker:
             return Answer(reply.text, read_reply(reply, schema))
         except ReplyError as error:
             return Answer(reply.text, None, str(error))
+
+    def parsed(self, text: str) -> PlannerReply:
+        """The reply that says one plan step, with the costs since the last one; text outside the grammar carries no step."""
+        said = parse_reply(text)
+        return self.reply(said.text, said.step, said.error)
 
     def reply(self, text: str, step: PlanStep | None, error: str = "") -> PlannerReply:
         """A planner's reply with the costs since the last one."""
