@@ -13,6 +13,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 from rich.console import Console
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from configs.compose import compose
 from configs.help import asks_for_help, help_text
@@ -62,7 +63,8 @@ def main(overrides: Sequence[str]) -> int:
             table.show()
         return 0
     try:
-        done = evaluate(cfg)
+        with logging_redirect_tqdm():  # retries and warnings above the progress bar, not across it
+            done = evaluate(cfg)
         folder = done.folder
         run = load_run(folder)
         table = write_report(run)
