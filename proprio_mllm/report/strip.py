@@ -66,16 +66,16 @@ def replay(run: Run, task: str, trial: int = 0, size: int = 320, camera: str = "
 
 
 def draw_strip(frames: Sequence[Frame], title: str, path: Path, per_row: int = 8) -> Path:
-    """Writes the frames as a picture, `per_row` steps in a line."""
+    """Writes the frames as a picture, at most `per_row` steps in a line, the lines of about equal length."""
     lines = -(-len(frames) // per_row)
-    columns = min(per_row, len(frames))
+    columns = -(-len(frames) // lines)
     figure = Figure(figsize=(2.4 * columns, 5.1 * lines + 0.4), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(2 * lines, columns, squeeze=False)
     for axes in grid.ravel():
         axes.axis("off")
     for number, frame in enumerate(frames):
-        line, column = divmod(number, per_row)
+        line, column = divmod(number, columns)
         grid[2 * line][column].imshow(frame.head)
         grid[2 * line][column].set_title(f"{number}", fontsize=8)
         below = grid[2 * line + 1][column]
