@@ -81,6 +81,7 @@ def test_every_yaml_composes(path: Path) -> None:
         ("eval", "planner=gpt4o backend.model=a(b", r"override 'backend\.model=a\(b' cannot be read"),
         ("eval", "planner=gpt4o planner.replans=${absent}", r"Interpolation key 'absent' not found"),
         ("eval", "planner=random planner.reflection=off", r"reflection 'off' with planner kind 'random', which has none"),
+        ("eval", "planner=gpt4o backend.timeout_s=inf", r"timeout_s inf outside \(0, 86400\]"),
         ("train", "seed=12345", r"seed 12345 outside \[0, 2000\]"),
         ("train", "selu.rounds=0", r"rounds 0 must be positive"),
         ("train", "selu.temperature=0", r"temperature 0\.0 must be positive"),
