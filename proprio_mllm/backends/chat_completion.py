@@ -39,8 +39,8 @@ _BROKEN: Final = frozenset({"error", "abort"})
 
 
 class _Part(BaseModel):
-    type: str = "text"
-    text: str = ""
+    type: str | None = "text"
+    text: str | None = None
 
 
 class _Message(BaseModel):
@@ -51,7 +51,7 @@ class _Message(BaseModel):
     def text(self) -> str:
         """The content; of parts, as some servers send, the texts among them."""
         if isinstance(self.content, list):
-            return "".join(part.text for part in self.content if part.type == "text")
+            return "".join(part.text or "" for part in self.content if part.type == "text")
         return self.content or ""
 
 

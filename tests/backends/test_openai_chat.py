@@ -100,6 +100,9 @@ def test_what_is_sent(cfg: BackendConfig, server: LoopbackServer) -> None:
         (completion("fine", finish_reason=None), "fine", "stop"),
         (completion("fine", finish_reason="eos_token"), "fine", "stop"),
         ({"choices": [{"message": {"content": "least"}}]}, "least", "stop"),
+        (completion(message={"content": [{"type": "text", "text": "in "}, {"text": "parts"}]}), "in parts", "stop"),
+        (completion(message={"content": [{"type": "image", "text": None}, {"type": "text", "text": "one"}]}), "one", "stop"),
+        (completion("half \ud83d"), "half ?", "stop"),
     ],
 )
 def test_ends_of_replies(cfg: BackendConfig, server: LoopbackServer, body: object, text: str, reason: str) -> None:
