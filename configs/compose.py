@@ -14,7 +14,7 @@ from typing import Any
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
@@ -24,6 +24,8 @@ from configs.validate import ConfigError
 __all__ = ["CONFIG_DIR", "compose", "groups"]
 
 CONFIG_DIR = Path(__file__).resolve().parent
+#: Of these groups fields can be set that the group's file leaves at their defaults.
+_OPEN = ("backend.", "planner.")
 
 
 def groups() -> dict[str, tuple[str, ...]]:
@@ -81,8 +83,7 @@ def _name_own_robots(overrides: Sequence[str]) -> list[str]:
 
 def _add_fields(overrides: Sequence[str]) -> list[str]:
     """Lets fields be set that a group's file leaves at their defaults; `build` refuses those that do not exist."""
-    open_groups = ("backend.", "planner.")
-    return [f"++{override}" if override.startswith(open_groups) else override for override in overrides]
+    return [f"++{override}" if override.startswith(_OPEN) else override for override in overrides]
 
 
 def _check_groups(overrides: Sequence[str]) -> None:
@@ -90,7 +91,7 @@ def _check_groups(overrides: Sequence[str]) -> None:
     known["robot"] = (*known["robot"], *own_files("robots"))
     for override in overrides:
         key, sep, value = override.partition("=")
-        if not sep and not key.startswith("~"):
+        if not key.strip("+~") or (not sep and not key.startswith("~")):
             raise ConfigError(f"override {override!r}: expected key=value")
         name = key.lstrip("+")
         if name in known and value not in known[name]:
@@ -108,7 +109,7 @@ def _explain(error: Exception, root: str, overrides: Sequence[str]) -> str:
             return f"configs/{root}.yaml does not compose: {_first_line(error)}"
     for override in overrides:
         key = override.partition("=")[0].lstrip("+~")
-        if key in groups():
+        if key in groups() or key.startswith(_OPEN):
             continue
         node: Any = config
         path: list[str] = []
@@ -118,6 +119,10 @@ def _explain(error: Exception, root: str, overrides: Sequence[str]) -> str:
                 return f"{'.'.join([*path, part])}: unknown key in {override!r}; allowed: {allowed}"
             path.append(part)
             node = node[part] if not OmegaConf.is_missing(node, part) else None
+    if isinstance(error, OverrideParseException):
+        override = str(error.override).removeprefix("++")
+        quoted = "\"key='value'\""  # for Hydra, and for the shell
+        return f"override {override!r} cannot be read; a value with ()[]{{}}=~ or letters outside ASCII needs quotes: {quoted}"
     return _first_line(error)
 
 

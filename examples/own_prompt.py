@@ -32,11 +32,13 @@ class Brief:
 
     def __init__(self, backend: Backend, options: ChatOptions) -> None:
         """Takes the run's backend and its options (`backend.image_size`, `backend.max_tokens`, `planner.history` and so on)."""
+        self.backend, self.options = backend, options
         self.image_size = options.image_size
-        self.asker = Asker(backend, options.max_tokens, options.temperature)
 
     def reset(self, task: TaskInfo, rng: np.random.Generator) -> None:
-        """A new episode; `rng` is its only source of randomness."""
+        """A new episode with an asker of its own; `rng` is its only source of randomness, samples above temperature 0 too."""
+        seed = int(rng.integers(2**31))
+        self.asker = Asker(self.backend, self.options.max_tokens, self.options.temperature, seed)
         self.rules = f'{role(task.robot)}\n\n{action_manual()}\n\nReply with one JSON object: {{"step": "..."}}'
 
     def step(self, observation: Observation, feedback: Feedback | None) -> PlannerReply:

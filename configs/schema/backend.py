@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 __all__ = ["BackendConfig", "BackendKind"]
 
 BackendKind = Literal["openai", "local", "replay", "scripted"]
+#: Longest wait, a day; the system's clock takes no endless one.
+_LONGEST_S: Final = 86_400.0
 
 
 def _require(condition: bool, message: str) -> None:
@@ -73,7 +75,7 @@ class BackendConfig:
         # not shown: whoever gives something else gives the key
         _require(self.key_env.isidentifier(), "key_env is the name of an environment variable; a key itself is never an option")
         _require(self.kind != "replay" or self.cache is not None, "backend kind 'replay' needs a cache, got null")
-        _require(self.timeout_s > 0.0, f"timeout_s {self.timeout_s} must be positive")
+        _require(0.0 < self.timeout_s <= _LONGEST_S, f"timeout_s {self.timeout_s} outside (0, {_LONGEST_S:g}]")
         _require(0 <= self.retries <= 20, f"retries {self.retries} outside [0, 20]")
         _require(1 <= self.concurrency <= 1024, f"concurrency {self.concurrency} outside [1, 1024]")
         _require(self.max_tokens > 0, f"max_tokens {self.max_tokens} must be positive")

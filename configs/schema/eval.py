@@ -209,8 +209,8 @@ class EvalConfig:
         chats = self.planner.kind in CHAT_KINDS
         asks = chats or (self.planner.kind == "file" and self.backend is not None)
         _require(
-            self.reflection == "on" or asks or self.planner.kind == "mllm",
-            f"reflection {self.reflection!r} with planner kind {self.planner.kind!r}, which has none; allowed: on",
+            (self.reflection == "on" and self.planner.reflection == "on") or asks or self.planner.kind == "mllm",
+            f"reflection 'off' with planner kind {self.planner.kind!r}, which has none; allowed: on",
         )
         _require(self.backend is not None or not chats, f"planner {self.planner.name!r} needs a backend, got null")
         _require(

@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from proprio_mllm.backends.protocol import ChatReply, FinishReason, LostReplyError
 
-__all__ = ["read_completion", "read_usage"]
+__all__ = ["read_completion", "read_usage", "shown_name"]
 
 _FINISHED: Final[Mapping[str, FinishReason]] = {
     "length": "length",
@@ -39,8 +39,8 @@ _BROKEN: Final = frozenset({"error", "abort"})
 
 
 class _Part(BaseModel):
-    type: str = "text"
-    text: str = ""
+    type: str | None = "text"
+    text: str | None = None
 
 
 class _Message(BaseModel):
@@ -51,7 +51,7 @@ class _Message(BaseModel):
     def text(self) -> str:
         """The content; of parts, as some servers send, the texts among them."""
         if isinstance(self.content, list):
-            return "".join(part.text for part in self.content if part.type == "text")
+            return "".join(part.text or "" for part in self.content if part.type == "text")
         return self.content or ""
 
 
@@ -98,7 +98,7 @@ def read_completion(body: bytes, content_type: str | None) -> ChatReply:
         prompt_tokens=prompt_tokens,
         completion_tokens=completion_tokens,
         finish_reason="refusal" if choice.message.refusal else _FINISHED.get(finished, "stop"),
-        model=_name(" ".join(name for name in (completion.model, completion.system_fingerprint) if name)),
+        model=shown_name(" ".join(name for name in (completion.model, completion.system_fingerprint) if name)),
     )
 
 
@@ -128,8 +128,8 @@ def _whole(body: bytes) -> bytes:
         return body  # no JSON; the parser below says why
 
 
-def _name(text: str) -> str:
-    """A name in one line, without what a terminal would obey."""
+def shown_name(text: str) -> str:
+    """A name that a server tells, in one line, without what a terminal would obey, and not too long."""
     return "".join(character for character in " ".join(text.split()) if character.isprintable())[:_NAME_CHARACTERS]
 
 

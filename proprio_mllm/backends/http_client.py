@@ -62,14 +62,15 @@ def bounded_client(timeout_s: float, own_machine: bool, limit_bytes: int = MAX_R
     """A client for `openai.OpenAI(http_client=...)`, for any number of threads.
 
     Args:
-        timeout_s: for one attempt, from its start to the last piece of its reply; looked at when a piece arrives and after
-            `timeout_s` of silence, so that an attempt ends before twice as long.
+        timeout_s: for one attempt, from its start to the last piece of its reply, unless a request has a time of its own;
+            looked at when a piece arrives and after as long a silence, so that an attempt ends before twice as long.
         own_machine: whether the server is on this machine: a proxy of the environment is then passed by.
         limit_bytes: longest body that is read.
     """
 
     def start(request: httpx2.Request) -> None:
-        request.extensions[_DEADLINE] = time.monotonic() + timeout_s
+        own_s = request.extensions.get("timeout", {}).get("read")
+        request.extensions[_DEADLINE] = time.monotonic() + (timeout_s if own_s is None else own_s)
 
     def bound(response: httpx2.Response) -> None:
         packed = response.headers.get("content-encoding", "identity")

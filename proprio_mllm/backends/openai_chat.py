@@ -20,7 +20,7 @@ import openai
 from configs.schema.backend import BackendConfig
 from proprio_mllm.backends.address import checked_url, on_this_machine
 from proprio_mllm.backends.api_failures import failure_of, is_refusal
-from proprio_mllm.backends.chat_completion import read_completion
+from proprio_mllm.backends.chat_completion import read_completion, shown_name
 from proprio_mllm.backends.http_client import MAX_REPLY_BYTES, bounded_client
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import (
@@ -116,10 +116,10 @@ class OpenAIChat:
             listed = self._client.with_options(timeout=_LIST_TIMEOUT_S, max_retries=0).models.list()
             cards = [card for card in listed.data if card.id == self._cfg.model]
             told = (cards[0].model_extra or {}).get("revision") if cards else None
-        except (openai.OpenAIError, AttributeError, TypeError) as error:
+        except (openai.OpenAIError, AttributeError, TypeError, ValueError, RecursionError) as error:  # or it is no list
             logger.debug("backend %s: no list of models: %s", self._cfg.name, self._secret.redact(str(error)))
             return ""
-        return self._secret.redact(told)[:_SHOWN_CHARACTERS] if isinstance(told, str) else ""
+        return shown_name(self._secret.redact(told)) if isinstance(told, str) else ""
 
     def close(self) -> None:
         """Closes its connections."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
+import operator
 import time
 import traceback
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -217,6 +218,30 @@ class _Tally:
         self.tokens = 0
         self.planner_s = 0.0
 
+    def add(self, reply: PlannerReply) -> None:
+        """Adds what a reply has cost; a planner may count in NumPy, but in nothing that a ledger cannot hold."""
+        own = reply.usage
+        calls, cached, reflections = (_whole(name, getattr(own, name)) for name in ("calls", "cached", "reflections"))
+        usd = None if own.usd is None else _finite("usage.usd", own.usd)
+        if not all(isinstance(model, str) for model in own.models):
+            raise TypeError(f"the reply's usage.models are {own.models!r}; allowed: names")
+        self.usage += Usage(calls, cached, reflections, usd, tuple(own.models))
+        self.tokens += _whole("tokens", int(reply.tokens))
+        self.planner_s += _finite("latency_s", reply.latency_s)
+
+
+def _whole(name: str, value: int) -> int:
+    count = operator.index(value)
+    if not 0 <= count < 2**63:
+        raise ValueError(f"the reply's {name} are below 0 or above 2**63")
+    return count
+
+
+def _finite(name: str, value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError(f"the reply's {name} is {value}; allowed: a finite number")
+    return float(value)
+
 
 def _loop(
     session: RunnableSession,
@@ -236,12 +261,9 @@ def _loop(
         if watch is not None:
             watch(shown, reply, feedback)
         reply = yield Ask(shown, None if feedback is None else feedback.public())
-        assert reply is not None
-        tally.usage += reply.usage
-        if not math.isfinite(reply.latency_s):
-            raise ValueError(f"the reply's latency_s is {reply.latency_s}; allowed: seconds")
-        tally.tokens += int(reply.tokens)  # a planner may count in NumPy
-        tally.planner_s += float(reply.latency_s)
+        if not isinstance(reply, PlannerReply):
+            raise TypeError(f"the planner's step() gave {type(reply).__name__}; allowed: PlannerReply")
+        tally.add(reply)
         if reply.step is None:
             feedback = None
             charged += 1
@@ -268,7 +290,7 @@ def _shown(observation: Observation, history: list[HistoryItem], step: int, step
 
 def _invalid(reply: PlannerReply) -> dict[str, Any]:
     outcome = {"action": "", "ok": False, "code": INVALID_OUTPUT, "category": "logical", "margins": {}, "contingency": ""}
-    return {"step": reply.text[:400], "outcomes": [outcome | {"message": reply.error[:200]}], "duration_s": 0.0}
+    return {"step": reply.text[:400], "outcomes": [outcome | {"message": str(reply.error)[:200]}], "duration_s": 0.0}
 
 
 def _traced(step: PlanStep, feedback: Feedback) -> dict[str, Any]:

@@ -122,9 +122,9 @@ class Ledger:
             self._handle.truncate(whole)
 
     def append(self, record: EpisodeRecord) -> None:
-        """Writes one record and waits until it is on the disk."""
+        """Writes one record and waits until it is on the disk; halves of characters, which UTF-8 has not, become `?`."""
         line = json.dumps(to_json(record), ensure_ascii=False, separators=(",", ":"), allow_nan=False)
-        self._handle.write(line.encode() + b"\n")
+        self._handle.write(line.encode(errors="replace") + b"\n")
         self._handle.flush()
         os.fsync(self._handle.fileno())
 

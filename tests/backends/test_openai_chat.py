@@ -100,6 +100,9 @@ def test_what_is_sent(cfg: BackendConfig, server: LoopbackServer) -> None:
         (completion("fine", finish_reason=None), "fine", "stop"),
         (completion("fine", finish_reason="eos_token"), "fine", "stop"),
         ({"choices": [{"message": {"content": "least"}}]}, "least", "stop"),
+        (completion(message={"content": [{"type": "text", "text": "in "}, {"text": "parts"}]}), "in parts", "stop"),
+        (completion(message={"content": [{"type": "image", "text": None}, {"type": "text", "text": "one"}]}), "one", "stop"),
+        (completion("half \ud83d"), "half ?", "stop"),
     ],
 )
 def test_ends_of_replies(cfg: BackendConfig, server: LoopbackServer, body: object, text: str, reason: str) -> None:
@@ -298,6 +301,12 @@ def test_nobody_listens(cfg: BackendConfig) -> None:
         (200, {"data": None}, ""),
         (200, ["what"], ""),
         (200, "no JSON", ""),
+        (200, b"", ""),
+        (200, b"<html>", ""),
+        (200, b"\xff", ""),
+        pytest.param(200, b"[" * 100_000, "", id="deep"),
+        (200, {"data": [{"id": "served-model", "revision": " a\n\x1b[31m\ud800b "}]}, "a [31mb"),
+        (200, {"data": [{"id": "served-model", "revision": f"{KEY} {'x' * 1000}"}]}, f"[key] {'x' * 194}"),
         (404, {"error": "no such path"}, ""),
     ],
 )
@@ -307,6 +316,28 @@ def test_the_revision_that_a_server_tells(
     server.answer = lambda handler: handler.send(status, body)
     backend = OpenAIChat(dataclasses.replace(cfg, model="served-model"))
     assert backend.revision() == revision
+    backend.close()
+
+
+def test_a_list_of_models_that_drips_is_not_waited_for(
+    cfg: BackendConfig, server: LoopbackServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("proprio_mllm.backends.openai_chat._LIST_TIMEOUT_S", 0.3)
+
+    def drip(handler: Handler) -> None:
+        handler.send_response(200)
+        handler.send_header("Content-Type", "application/json")
+        handler.send_header("Content-Length", "1000")
+        handler.end_headers()
+        for _ in range(100):
+            handler.wfile.write(b" ")
+            time.sleep(0.05)
+
+    server.answer = drip
+    backend = OpenAIChat(cfg)
+    start = time.perf_counter()
+    assert backend.revision() == ""
+    assert time.perf_counter() - start < 2.0
     backend.close()
 
 

@@ -189,6 +189,15 @@ def test_a_prompt_of_ones_own_asks_the_runs_backend(cfg, session, threads: int) 
     assert any(record.invalid_output for record in result.records), "`walk` is no action"
 
 
+def test_samples_of_a_prompt_of_ones_own_are_its_episodes(cfg, session, tmp_path) -> None:
+    own = PlannerConfig("brief", "file", "Brief", source=f"{OWN_PROMPT}:Brief")
+    warm = dataclasses.replace(script(cfg, "brief"), temperature=0.7, cache=str(tmp_path / "replies.sqlite"))
+    first = run(cfg, session, planner=own, backend=warm, trials=2)
+    again = run(cfg, session, planner=own, backend=warm, trials=2, threads=3, output=str(tmp_path / "again"))
+    assert not any(record.cached_calls for record in first.records), "no trial repeats the samples of another"
+    assert all(record.cached_calls == record.planner_calls for record in again.records)
+
+
 def test_a_planner_of_a_file_that_takes_no_backend_is_refused_with_one(cfg, session, tmp_path) -> None:
     own = PlannerConfig("near", "file", "Near", source=f"{OWN_PROMPT.with_name('own_planner.py')}:Nearby")
     with pytest.raises(CodeFileError, match=r"Nearby\(backend, options\) failed: TypeError"):

@@ -9,7 +9,8 @@ import pytest
 
 from data.records import FailureCategory, Outcome
 from proprio_mllm.evaluation.episode import run_episode
-from proprio_mllm.evaluation.ledger import Ledger
+from proprio_mllm.evaluation.ledger import Ledger, read_ledger
+from proprio_mllm.planners.protocol import Usage
 
 SOLVED = ("GoTo(Mug_1)", "MoveDown(0.2)", "Pick(left, Mug_1)")
 
@@ -112,6 +113,42 @@ def test_a_planner_may_count_in_numpy_but_not_in_nan(session, scripted, fields, 
         assert (record.planner_tokens, record.planner_s) == (21, 1.5)
     else:
         assert "latency_s is nan" in record.message
+
+
+@pytest.mark.parametrize(
+    ("usage", "message"),
+    [
+        (Usage(np.int64(1), np.int64(1), np.int8(0), np.float32(0.5), ("a", "b")), ""),
+        (Usage(1, usd=None, models=("half \ud83d",)), ""),
+        (Usage(1.5), "'float' object cannot be interpreted as an integer"),
+        (Usage(-1), "the reply's calls are below 0"),
+        (Usage(1, usd=float("inf")), "the reply's usage.usd is inf"),
+        (Usage(1, models=(3,)), r"usage.models are (3,); allowed: names"),
+        (None, "'NoneType' object has no attribute"),
+    ],
+)
+def test_what_a_planner_says_it_cost_never_spoils_the_ledger(session, scripted, fields, tmp_path, usage, message) -> None:
+    planner = scripted(*SOLVED)
+    said = planner.step
+    planner.step = lambda *seen: dataclasses.replace(said(*seen), usage=usage)
+    record = play(session(), planner, fields)
+    assert record.outcome is (Outcome.INFRASTRUCTURE_ERROR if message else Outcome.SUCCESS)
+    assert message in record.message
+    path = tmp_path / "ledger.jsonl"
+    with Ledger(path) as ledger:
+        ledger.append(record)
+    (again,) = read_ledger(path)
+    assert (again.planner_calls, again.planner_usd, again.cached_calls) == (
+        record.planner_calls, record.planner_usd, record.cached_calls
+    )  # fmt: skip
+
+
+def test_a_step_that_forgets_to_answer_is_named(session, scripted, fields) -> None:
+    planner = scripted(*SOLVED)
+    planner.step = lambda *seen: None
+    record = play(session(), planner, fields)
+    assert record.outcome is Outcome.INFRASTRUCTURE_ERROR
+    assert "the planner's step() gave NoneType; allowed: PlannerReply" in record.message
 
 
 def test_an_error_while_opening_is_recorded_too(scripted, fields) -> None:

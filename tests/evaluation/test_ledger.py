@@ -26,6 +26,13 @@ def test_round_trip(tmp_path, record) -> None:
     assert again == record and again.failure is FailureCategory.LOGICAL  # a step too far, then a reply that is none
 
 
+def test_half_a_character_is_a_question_mark(tmp_path, record) -> None:
+    path = tmp_path / "ledger.jsonl"
+    with Ledger(path) as ledger:
+        ledger.append(dataclasses.replace(record, message="no file \udcff.png"))
+    assert [again.message for again in read_ledger(path)] == ["no file ?.png"]
+
+
 def test_no_file_is_no_record(tmp_path) -> None:
     assert read_ledger(tmp_path / "none.jsonl") == []
 
