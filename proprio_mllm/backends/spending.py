@@ -47,17 +47,18 @@ class Spending:
     Args:
         path: made when absent.
         cap_usd: most that the run may spend; None books without a limit.
+        read_only: opens a file that exists, to look at.
 
     Raises:
         BackendSetupError: when the file is damaged, something else, or of another version.
         ValueError: on a negative cap.
     """
 
-    def __init__(self, path: Path, cap_usd: float | None) -> None:
+    def __init__(self, path: Path, cap_usd: float | None, read_only: bool = False) -> None:
         if cap_usd is not None and not cap_usd >= 0.0:
             raise ValueError(f"cost_cap_usd {cap_usd} must not be negative")
         self.cap_usd = cap_usd
-        self._database = Database(path, _TABLES)
+        self._database = Database(path, _TABLES, read_only)
 
     def book(self, bound_usd: float, backend: str = "", purpose: str = "") -> int:
         """Books the most that a call can cost; the booking's number.

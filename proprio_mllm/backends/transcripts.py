@@ -60,7 +60,13 @@ def shown(store: ReplyStore, start: str) -> str:
 
 
 def export_lines(store: ReplyStore, path: Path) -> int:
-    """Writes every call as one JSON line; how many."""
+    """Writes every call as one JSON line; how many.
+
+    Raises:
+        ValueError: when something other than a plain file is there, or the recorded replies themselves.
+    """
+    if path.exists() and (not path.is_file() or path.samefile(store.path)):
+        raise ValueError(f"{path} is no plain file, or the recorded replies themselves; it is not replaced")
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     count = 0
     with temporary.open("w", encoding="utf-8") as file:
@@ -94,16 +100,17 @@ def import_lines(store: ReplyStore, path: Path) -> tuple[int, int]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; 0 on success, 2 on wrong arguments or files."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if asks_for_help(given):
-        sys.stdout.write(f"Recorded replies: {_USAGE}\n\n{_ABOUT}")
-        return 0
     try:
-        path, options = _split(given)
-        store = ReplyStore(path, read_only="import" not in options)
-        try:
-            _run(store, options)
-        finally:
-            store.close()
+        if asks_for_help(given):
+            sys.stdout.write(f"Recorded replies: {_USAGE}\n\n{_ABOUT}")
+        else:
+            path, options = _split(given)
+            store = ReplyStore(path, read_only="import" not in options)
+            try:
+                _run(store, options)
+            finally:
+                store.close()
+        sys.stdout.flush()  # what cannot be written is noticed here, not at the program's end
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (BackendError, ValueError, OSError) as error:

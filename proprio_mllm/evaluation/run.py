@@ -292,9 +292,9 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
     folder = run_folder(cfg, digest)
     folder.mkdir(parents=True, exist_ok=True)
     metadata = _metadata(cfg, jobs, digest, cfg.planner.kind == "expert")
-    write_text(folder / "run.json", json.dumps(metadata, indent=1) + "\n")
     path = folder / "ledger.jsonl"
     with Ledger(path) as ledger:
+        write_text(folder / "run.json", json.dumps(metadata, indent=1) + "\n")  # not while another process runs what it says
         scores = scored(read_ledger(path))
         wanted = [_fields_key(job) for job in jobs]
         missing = [job for job, key in zip(jobs, wanted, strict=True) if key not in scores]

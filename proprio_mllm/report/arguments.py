@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from configs.arguments import read_arguments
+from configs.help import asks_for_help
 from configs.validate import ConfigError
 
 __all__ = ["read_named"]
@@ -23,8 +24,11 @@ def read_named(cls: type[T], arguments: Sequence[str], names: tuple[str, ...], m
         more: whether the last one may be given several times.
 
     Raises:
+        SystemExit: after `-h` or `--help`, with code 0.
         ConfigError: on too few or too many names, or a wrong option.
     """
+    if asks_for_help(arguments):
+        read_arguments(cls, arguments)
     given = [argument for argument in arguments if "=" not in argument]
     if len(given) < len(names) or (len(given) > len(names) and not more):
         expected = " ".join(names) + (f" [{names[-1]} ...]" if more else "")

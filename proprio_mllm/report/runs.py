@@ -7,6 +7,7 @@ from pathlib import Path
 
 from data.files import write_text
 from proprio_mllm.backends.making import SPENDING_FILE
+from proprio_mllm.backends.protocol import BackendError
 from proprio_mllm.backends.spending import Spending
 from proprio_mllm.report.references import references_of
 from proprio_mllm.report.stored import Run, find_runs, load_run
@@ -41,11 +42,14 @@ def _paid(path: Path) -> list[str]:
     """What the run's own calls have cost, those of broken and unfinished episodes included."""
     if not path.is_file():
         return []
-    spending = Spending(path, None)
     try:
-        total, unknown = spending.total_usd(), spending.open_usd()
-    finally:
-        spending.close()
+        spending = Spending(path, None, read_only=True)
+        try:
+            total, unknown = spending.total_usd(), spending.open_usd()
+        finally:
+            spending.close()
+    except BackendError as error:
+        return [f"What this run has paid cannot be read: {error}."]
     lost = f", {unknown:.4f} of it booked for calls whose reply never came" if unknown else ""
     return [f"This run has paid {total:.4f} USD so far, broken and unfinished episodes included{lost}."] if total else []
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,7 +15,7 @@ from pydantic import BaseModel
 from proprio_mllm.backends.cache import CachedBackend, ReplayBackend, main
 from proprio_mllm.backends.protocol import ChatReply
 from proprio_mllm.backends.replies import question_of
-from tests.backends.loopback import IMAGE, Answering, ask, finished, started
+from tests.backends.loopback import IMAGE, ROOT, Answering, ask, finished, started
 
 
 class Steps(BaseModel):
@@ -117,6 +120,30 @@ def test_files_that_are_not_there(tmp_path: Path, capsys) -> None:
     assert "there is no" in capsys.readouterr().err
     assert main([str(tmp_path / "new.sqlite"), f"import={tmp_path / 'none.jsonl'}"]) == 2
     assert "none.jsonl" in capsys.readouterr().err
+
+
+def test_an_export_replaces_plain_files_alone(path: Path, tmp_path: Path, capsys) -> None:
+    recorded, pipe = path.read_bytes(), tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for target in (path, pipe, tmp_path):
+        assert main([str(path), f"export={target}"]) == 2
+        assert "it is not replaced" in capsys.readouterr().err
+    assert path.read_bytes() == recorded
+    assert pipe.is_fifo()
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["FILE"]])
+def test_a_reader_that_has_seen_enough_is_no_error(path: Path, arguments: list[str]) -> None:
+    given = [str(path) if argument == "FILE" else argument for argument in arguments]
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        command = [sys.executable, "-m", "proprio_mllm.backends.cache", *given]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": ""}
+        done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, timeout=60, env=environment)
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_as_a_program(path: Path) -> None:

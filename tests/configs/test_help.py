@@ -15,6 +15,7 @@ from configs.help import help_text
 from configs.schema.eval import EvalConfig
 from configs.schema.train import TrainConfig
 from proprio_mllm.backends.serve import ServeConfig
+from proprio_mllm.report.export import main as export_main
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +70,15 @@ def test_lines_that_go_on_and_fields_that_share_one() -> None:
     from configs.help import _meanings
 
     assert _meanings(_Inner) == {"steps": "how many, over two lines.", "a": "share one meaning.", "b": "share one meaning."}
+
+
+def test_reports_have_a_help_without_a_run(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        export_main(["--help"])
+    assert end.value.code == 0
+    said = capsys.readouterr().out
+    assert said.startswith("Runs for other tools: `python -m proprio_mllm.report.export RUN [RUN ...] format=sft|jsonl")
+    assert re.search(r"^  format=… ", said, re.M)
 
 
 def test_tools_without_groups_have_a_help_too(capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ import configs
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
 from data.records import Outcome
-from proprio_mllm.evaluation.ledger import read_ledger
+from proprio_mllm.evaluation.ledger import Ledger, LedgerError, read_ledger
 from proprio_mllm.evaluation.run import evaluate, plan_episodes, run_folder, select_tasks, weights_digest
 from proprio_mllm.planners.protocol import WeightsError
 from proprio_mllm.report.runs import load_run, write_report
@@ -54,6 +54,17 @@ def test_runs_every_task_once_and_continues(cfg, session) -> None:
     more = evaluate(dataclasses.replace(cfg, limit=1), opener)
     assert [record.task for record in more.records] == ["t0", "t2", "t3"]
     assert more.folder != first.folder
+
+
+def test_a_run_under_way_keeps_its_plan(cfg, session, tmp_path) -> None:
+    other = tmp_path / "elsewhere" / "tasks.jsonl"
+    other.parent.mkdir()
+    other.write_text("".join(Path(cfg.tasks).read_text().splitlines(keepends=True)[:2]))
+    first = evaluate(cfg, lambda setup, job, planner: session())
+    plan = (first.folder / "run.json").read_text()
+    with Ledger(first.folder / "ledger.jsonl"), pytest.raises(LedgerError, match="is being written by another process"):
+        evaluate(dataclasses.replace(cfg, tasks=str(other)), lambda setup, job, planner: session())
+    assert (first.folder / "run.json").read_text() == plan
 
 
 def test_errors_are_rerun_never_scored(cfg, session) -> None:

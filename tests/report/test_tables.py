@@ -201,6 +201,16 @@ def test_what_a_run_has_paid_counts_what_no_score_shows(tmp_path, run) -> None:
     )
 
 
+def test_bookings_that_cannot_be_read_do_not_cost_a_run_its_report(tmp_path, run) -> None:
+    folder = run(tmp_path, backend={"kind": "openai", "name": "gpt4o", "model": "gpt-4o"})
+    bookings = folder / "spending.sqlite"
+    for damage in (b"no database at all, but of some length " * 40, b""):
+        bookings.write_bytes(damage)
+        (note,) = [note for note in run_report(load_run(folder)).notes if "paid" in note]
+        assert note.startswith(f"What this run has paid cannot be read: {bookings} is ")
+        assert bookings.read_bytes() == damage
+
+
 def test_a_run_that_is_not_finished_says_so_in_every_table(tmp_path, run) -> None:
     ledger = run(tmp_path, "proprio", "h1") / "ledger.jsonl"
     lines = ledger.read_text().splitlines(keepends=True)
