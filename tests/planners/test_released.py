@@ -27,6 +27,7 @@ PARTS = {
     "no_mpe": ("mrope", True, True),
     "no_cse": ("rope_sign", False, True),
     "no_mpe_cse": ("mrope", False, True),
+    "no_proprio": ("mrope", False, False),
 }
 STAGES = ["base", "corrections", "pointmap", "tokenizer", "alignment", "selu"]
 
