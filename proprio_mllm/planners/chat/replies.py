@@ -1,7 +1,7 @@
 """What models are asked to reply: pydantic models, and how a text becomes one of them.
 
 Every reply is validated here, whatever the server promised. JSON may stand in a code fence or after other text: the first
-object that is complete counts. Nothing is repaired.
+object that is complete counts. Nothing is repaired, but that half a character becomes `?`.
 """
 
 from __future__ import annotations
@@ -80,7 +80,9 @@ def read_json(text: str) -> object:
         if start < 0:
             break
         try:
-            return decoder.raw_decode(text, start)[0]
+            value = decoder.raw_decode(text, start)[0]
+            # an escape can spell half a character, which neither a prompt nor a file can hold
+            return json.loads(json.dumps(value, ensure_ascii=False).encode(errors="replace"))
         except (ValueError, RecursionError):  # not JSON, or a number of more digits than Python reads
             continue
     raise ReplyError(f"no JSON object in {_short(text)}")

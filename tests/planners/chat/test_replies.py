@@ -51,6 +51,12 @@ def test_a_number_too_long_to_read_is_a_wrong_reply() -> None:
         read_json('{"steps": ["Done()"], "n": ' + "9" * 5000 + "}")
 
 
+def test_half_a_character_is_a_question_mark() -> None:
+    half = r'{"steps": ["walk \ud83d"], "reasoning": "whole \ud83d\ude00"}'
+    plan = read_reply(ChatReply(half), Plan)
+    assert (plan.steps, plan.reasoning) == (["walk ?"], "whole \U0001f600")
+
+
 def test_a_reply_of_braces_alone_is_soon_given_up() -> None:
     before = time.process_time()
     with pytest.raises(ReplyError, match="no JSON object"):
