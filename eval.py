@@ -74,7 +74,8 @@ def main(overrides: Sequence[str]) -> int:
     if done.stopped:
         console.print(f"eval.py: the run has stopped: {done.stopped}", style="red", markup=False, soft_wrap=True)
     console.print(f"ledger, summary.json and tables: {folder}", markup=False, soft_wrap=True)
-    table.show()
+    if run.records or not done.stopped:
+        table.show()
     return 0 if run.complete else 1
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import logging
 import sys
 import threading
@@ -17,11 +18,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from configs.schema.backend import BackendConfig
+from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import Backend, BackendError, BackendSetupError, ChatReply, ChatRequest
 from proprio_mllm.backends.replies import ReplyStore, question_of
 from proprio_mllm.backends.transcripts import main
 
-__all__ = ["CachedBackend", "ReplayBackend"]
+__all__ = ["CachedBackend", "ReplayBackend", "recorded_revision"]
 
 _SHOWN_CHARACTERS: Final = 80
 _SHOWN_OTHERS: Final = 5
@@ -81,6 +84,27 @@ class CachedBackend:
         if first is None:
             return reply
         return dataclasses.replace(reply, text=first.text, finish_reason=first.finish_reason, model=first.model)
+
+
+def recorded_revision(cfg: BackendConfig, path: Path) -> str:
+    """Revision of the newest recorded replies of a backend whose revision is not known; "" when there are none.
+
+    Raises:
+        BackendSetupError: when the file cannot be used.
+    """
+    if not path.is_file():
+        return ""
+    store = ReplyStore(path, read_only=True)
+    try:
+        held = store.identities()
+    finally:
+        store.close()
+    for identity in held:
+        with contextlib.suppress(ValueError, AttributeError):
+            revision = str(json.loads(identity).get("revision", ""))
+            if identity == identity_of(dataclasses.replace(cfg, revision=revision)):
+                return revision
+    return ""
 
 
 class ReplayBackend:

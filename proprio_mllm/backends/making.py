@@ -12,7 +12,7 @@ from typing import Final
 
 from configs.schema.backend import BackendConfig
 from proprio_mllm.backends.address import on_this_machine
-from proprio_mllm.backends.cache import CachedBackend, ReplayBackend
+from proprio_mllm.backends.cache import CachedBackend, ReplayBackend, recorded_revision
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.prices import price_of
 from proprio_mllm.backends.protocol import Backend
@@ -65,6 +65,8 @@ def make_backend(cfg: BackendConfig, run: Path | None, cap_usd: float | None = N
 def told_revision(cfg: BackendConfig) -> str:
     """The revision that a server of this machine tells of its model; "" for what is not asked, or tells none.
 
+    Of a server that is not there it is the revision whose replies were recorded last, so that a run can be repeated without it.
+
     Raises:
         BackendSetupError: when the backend cannot be made.
     """
@@ -74,9 +76,15 @@ def told_revision(cfg: BackendConfig) -> str:
 
     chat = OpenAIChat(cfg)
     try:
-        return chat.revision()
+        told = chat.revision()
     finally:
         chat.close()
+    if told is None:
+        told = "" if cfg.cache is None else recorded_revision(cfg, Path(cfg.cache))
+        logger.warning(
+            "backend %s: %s does not answer%s", cfg.name, cfg.base_url, f"; its recorded replies are of {told}" if told else ""
+        )
+    return told
 
 
 def check_cap(cfg: BackendConfig, cap_usd: float | None) -> None:

@@ -100,15 +100,15 @@ class OpenAIChat:
         latency_s = time.perf_counter() - start
         if isinstance(reply, BackendError):  # raised out here, so that no error of the client hangs on it
             where = f"{self._client.base_url}: " if isinstance(reply, UnreachableError) else ""
-            hint = "; `make serve` starts this project's server" if where and self._own_machine else ""
+            hint = "; is a server running there? `make serve` starts this project's" if where and self._own_machine else ""
             raise type(reply)(f"backend {self._cfg.name}: {where}{_shortened(self._secret.redact(str(reply)))}{hint}")
         if reply.prompt_tokens == 0 and reply.finish_reason != "refusal":
             logger.warning("backend %s: a reply without usable token counts", self._cfg.name)
         text, model = self._secret.redact(reply.text), self._secret.redact(reply.model)
         return dataclasses.replace(reply, text=text, model=model, latency_s=latency_s)
 
-    def revision(self) -> str:
-        """Revision of the model as the server's list of models tells it; "" when it tells none or cannot be asked.
+    def revision(self) -> str | None:
+        """Revision of the model as the server's list of models tells it; "" when it tells none, None when it is not there.
 
         OpenAI's format has no such field. The server of this project tells it, so that its replies are known by the weights.
         """
@@ -116,6 +116,8 @@ class OpenAIChat:
             listed = self._client.with_options(timeout=_LIST_TIMEOUT_S, max_retries=0).models.list()
             cards = [card for card in listed.data if card.id == self._cfg.model]
             told = (cards[0].model_extra or {}).get("revision") if cards else None
+        except openai.APIConnectionError as error:
+            return None if isinstance(failure_of(error, _LIST_TIMEOUT_S, 0), UnreachableError) else ""
         except (openai.OpenAIError, AttributeError, TypeError, ValueError, RecursionError) as error:  # or it is no list
             logger.debug("backend %s: no list of models: %s", self._cfg.name, self._secret.redact(str(error)))
             return ""

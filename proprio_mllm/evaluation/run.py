@@ -172,10 +172,12 @@ def run_folder(cfg: EvalConfig, digest: str) -> Path:
 
 def _label(cfg: EvalConfig) -> str:
     """The planner's label, with the model where that is not the one of the label."""
-    if cfg.backend is None or cfg.backend.name == cfg.planner.name:
+    backend = cfg.backend
+    if backend is None or (backend.name == cfg.planner.name and backend.kind != "local"):
         return cfg.planner.label
     planner = "Plain prompting" if cfg.planner.kind == "plain" else cfg.planner.label
-    return f"{planner} on {cfg.backend.model or cfg.backend.name}"
+    model = Path(backend.model).resolve().name if backend.kind == "local" else backend.model
+    return f"{planner} on {model or backend.name}"
 
 
 def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileged: bool) -> dict[str, Any]:

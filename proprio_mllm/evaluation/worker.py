@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from configs.schema.backend import BackendConfig
 from configs.schema.eval import DifficultyName, PlannerConfig, StartName
@@ -35,6 +35,9 @@ from sim.tasks.task import Task
 
 if TYPE_CHECKING:
     from proprio_mllm.evaluation.recording import RolloutRecorder
+
+#: Calls in a row that do not reach a server which has answered before, each with its repetitions, until the run stops.
+_MOST_UNREACHED: Final = 5
 
 __all__ = ["EpisodeJob", "EpisodeResult", "EpisodeWorker", "Opener", "PlannerServer", "WorkerSetup", "lost_episode"]
 
@@ -280,7 +283,7 @@ class _Chats:
         assert setup.backend is not None
         self._setup, self._cfg = setup, setup.backend
         self._backend = make_backend(setup.backend, Path(setup.folder), setup.cap_usd)
-        self._answered = False
+        self._answered, self._unreached = False, 0
         self.stop = ""
 
     def planner(self) -> Planner:
@@ -296,7 +299,7 @@ class _Chats:
         """The backend's reply; what it says when it can answer no more is kept.
 
         A server that is not reached before it has answered anything is taken for a wrong address; one that goes away later
-        may come back.
+        may come back, until so many calls in a row have not reached it.
         """
         try:
             reply = self._backend.complete(request)
@@ -304,9 +307,11 @@ class _Chats:
             self.stop = str(error)
             raise
         except UnreachableError as error:
-            self.stop = self.stop or ("" if self._answered else str(error))
+            self._unreached += 1
+            self.stop = self.stop or ("" if self._answered and self._unreached < _MOST_UNREACHED else str(error))
             raise
-        self._answered = self._answered or not reply.cached
+        if not reply.cached:
+            self._answered, self._unreached = True, 0
         return reply
 
     def close(self) -> None:

@@ -29,8 +29,10 @@ def load_planner(source: str, *given: object) -> Planner:
     try:
         planner = found(*given)
     except Exception as error:
-        call = f"{name}({'backend, options' if given else ''})"
-        raise CodeFileError(f"{path}: {call} failed: {type(error).__name__}: {error}") from error
+        call, hint = f"{name}({'backend, options' if given else ''})", ""
+        if not given and isinstance(error, TypeError):
+            hint = "; a class that takes (backend, options) needs backend=NAME"
+        raise CodeFileError(f"{path}: {call} failed: {type(error).__name__}: {error}{hint}") from error
     wanted = {"privileged": bool, "image_size": int}
     missing = [f"{key} ({kind.__name__})" for key, kind in wanted.items() if not isinstance(getattr(planner, key, None), kind)]
     missing += [f"{key}()" for key in ("reset", "step") if not callable(getattr(planner, key, None))]

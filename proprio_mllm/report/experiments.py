@@ -50,8 +50,10 @@ def _models(runs: Sequence[Run], planner: str) -> list[str | None]:
 def _title(planner: str, model: str | None) -> str:
     """A row's name: the planner's label, and the model behind it where that is a choice or not the planner's own."""
     label, kind = _label(planner), _planner(planner).get("kind")
-    if not model or (kind == "plain" and _own_model(planner) in (model, "")):
+    if not model or (kind == "plain" and _own_model(planner) == model):
         return label
+    if Path(model).is_dir():
+        model = Path(model).resolve().name
     return f"Plain prompting ({model})" if kind == "plain" else f"{label} ({model})"
 
 

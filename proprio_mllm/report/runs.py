@@ -22,12 +22,12 @@ def run_notes(run: Run) -> list[str]:
     notes = []
     missing = len(run.metadata["planned"]) - len(run.records)
     if missing:
-        notes.append(f"{missing} of {len(run.metadata['planned'])} episodes have no score; the same command goes on with them.")
+        notes.append(f"{missing} of {len(run.metadata['planned'])} episodes have no score.")
     if run.broken:
         notes.append(f"{len(run.broken)} attempts broke for reasons outside the planner; they are not scored.")
     if run.machinery:
         notes.append("A script answered in place of a model: this tests the machinery and is no result.")
-    if run.backend:
+    if run.backend and run.records:
         priced = [record.planner_usd for record in run.records]
         spent = "an unknown price" if None in priced else f"{sum(filter(None, priced)):.4f} USD when they were made"
         calls, cached = sum(r.planner_calls for r in run.records), sum(r.cached_calls for r in run.records)

@@ -287,7 +287,7 @@ def test_nobody_listens(cfg: BackendConfig) -> None:
     error = error_of(cfg, base_url="http://127.0.0.1:1/v1")
     assert type(error) is UnreachableError
     assert "http://127.0.0.1:1/v1/: no connection after 1 attempt: ConnectError" in str(error)
-    assert str(error).endswith("; `make serve` starts this project's server")
+    assert str(error).endswith("; is a server running there? `make serve` starts this project's")
 
 
 @pytest.mark.parametrize(
@@ -343,7 +343,7 @@ def test_a_list_of_models_that_drips_is_not_waited_for(
 
 def test_nobody_tells_a_revision(cfg: BackendConfig) -> None:
     backend = OpenAIChat(dataclasses.replace(cfg, base_url="http://127.0.0.1:1/v1"))
-    assert backend.revision() == ""
+    assert backend.revision() is None
     backend.close()
 
 

@@ -49,6 +49,11 @@ def keyless(request):
 def nowhere(request):
     raise UnreachableError("script: no connection")
 
+def away(request):
+    if len(calls) >= 3:
+        raise UnreachableError("script: no connection")
+    return answer(request)
+
 def gone(request):
     if len(calls) == 3:
         calls.append(0)
@@ -155,7 +160,7 @@ def test_an_outage_is_never_a_score(cfg, session) -> None:
 def test_a_backend_that_cannot_be_made_stops_before_anything_is_written(cfg, session, tmp_path) -> None:
     assert cfg.backend is not None
     wrong = dataclasses.replace(cfg.backend, source=f"{tmp_path / 'script.py'}:nothing")
-    with pytest.raises(BackendSetupError, match="has no function 'nothing'; it has: answer, brief, dear"):
+    with pytest.raises(BackendSetupError, match="has no function 'nothing'; it has: answer, away, brief, dear"):
         run(cfg, session, backend=wrong)
     assert not (tmp_path / "out").exists()
 
@@ -235,3 +240,9 @@ def test_other_weights_behind_a_server_are_another_run(cfg, tmp_path) -> None:
         folders.append(run_folder(dataclasses.replace(cfg, backend=backend), ""))
     assert told == ["one", "two", "two", ""]
     assert folders[0] != folders[1] == folders[2] != folders[3]
+
+
+def test_a_server_that_stays_away_stops_the_run(cfg, session) -> None:
+    stopped = run(cfg, session, backend=script(cfg, "away"), retries=3)
+    assert stopped.stopped == "script: no connection"
+    assert 0 < len(stopped.records) + len(stopped.broken) < 9

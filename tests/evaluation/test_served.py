@@ -58,6 +58,10 @@ def test_a_planner_asks_the_served_model_and_repeats_the_run_without_it(
     assert all(model.endswith(f"@{revision}") for record in first.records for model in record.models)
     nowhere = dataclasses.replace(cfg.backend, kind="replay", base_url="http://127.0.0.1:9/v1", revision=revision)
     again = evaluate(dataclasses.replace(cfg, backend=nowhere, output=str(tmp_path / "b"), threads=1))
+    gone = dataclasses.replace(cfg.backend, base_url="http://127.0.0.1:9/v1")  # nobody listens; its replies are known
+    repeated = evaluate(dataclasses.replace(cfg, backend=gone, output=str(tmp_path / "c"), threads=1))
+    assert repeated.folder.name == first.folder.name
+    assert all(record.cached_calls == record.planner_calls for record in repeated.records)
     for record, replayed in zip(first.records, again.records, strict=True):
         assert replayed.cached_calls == replayed.planner_calls
         assert replayed.trace == record.trace
