@@ -166,6 +166,16 @@ def test_a_run_over_a_part_of_the_tasks_makes_no_row(tmp_path, run) -> None:
     assert [row[0] for row in table.rows if row[1] == "ours"] == ["DAG-Plan (base)"]
 
 
+@pytest.mark.parametrize("changed", [{"body": True}, {"parallel": False}, {"horizon": 3}])
+def test_a_planner_with_other_options_fills_no_cell(tmp_path, run, changed: dict) -> None:
+    run(tmp_path, "dag_plan", "h1", config={"planner": changed})
+    assert newest(find_runs(tmp_path), "dag_plan", "h1", "easy") is None
+    run(tmp_path / "other", "dag_plan", "h1", contingencies="unlucky")
+    assert newest(find_runs(tmp_path / "other"), "dag_plan", "h1", "easy") is None
+    run(tmp_path / "plain", "dag_plan", "h1", config={"planner": {"horizon": 1}})
+    assert newest(find_runs(tmp_path / "plain"), "dag_plan", "h1", "easy") is not None
+
+
 def test_an_unknown_planner_is_named(tmp_path, run) -> None:
     run(tmp_path, "mine", "h1")
     assemble(ExperimentConfig("main_table", ("mine", "gpt4o")), tmp_path)
