@@ -30,6 +30,7 @@ from configs.schema.eval import EvalConfig
 from configs.validate import build
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.run import evaluate
+from proprio_mllm.planners.memory import MemoryFileError, check_memory
 from sim.tasks.certificates import load_certificates
 from sim.tasks.task import Task, load_benchmark, write_tasks
 
@@ -103,12 +104,22 @@ def scheduling(robot: str, count: int, folder: Path, memory: str) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", type=int, default=20)
-    parser.add_argument("--robot", default="h1")
+    parser.add_argument("--robot", default="h1", choices=("h1", "x1"))
     parser.add_argument("--mistakes", type=float, default=0.15)
     parser.add_argument("--memory", default="outputs/memory")
     parser.add_argument("--planners", default=",".join(PLANNERS))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
+    planners = options.planners.split(",")
+    unknown = [name for name in planners if name not in PLANNERS]
+    if unknown or not 0.0 <= options.mistakes <= 1.0 or options.tasks < 1:
+        allowed = f"--planners of {','.join(PLANNERS)}; --mistakes in [0, 1]; --tasks at least 1"
+        parser.error(f"--planners {options.planners} --mistakes {options.mistakes} --tasks {options.tasks}; allowed: {allowed}")
+    if {"llm_planner", "rap"} & set(planners):
+        try:
+            check_memory(Path(options.memory))
+        except MemoryFileError as error:
+            parser.error(str(error))
     tasks = chosen(options.robot, options.tasks)
     rows = [
         f"{len(tasks)} tasks of {len({task.family for task in tasks})} families, {options.robot}; a script in a model's place.",
@@ -119,7 +130,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "tasks.jsonl"
         write_tasks(tasks, file)
-        for planner in options.planners.split(","):
+        for planner in planners:
             for mistakes, difficulty, reflection in (
                 (0.0, "easy", "on"),
                 (options.mistakes, "easy", "on"),
@@ -134,7 +145,7 @@ def main() -> None:
                 rows.append(line(name, run(planner, changes, file, output, options.memory)))
                 sys.stdout.write(rows[-1] + "\n")
                 sys.stdout.flush()
-        if "dag_plan" in options.planners:
+        if "dag_plan" in planners:
             rows += ["", *scheduling(options.robot, options.tasks, Path(folder), options.memory)]
     text = "\n".join(rows) + "\n"
     sys.stdout.write("\n" + text)

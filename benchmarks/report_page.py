@@ -13,6 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from configs.help import asks_for_help
 from proprio_mllm.report.html import page, run_data
 from proprio_mllm.report.runs import load_run
 from tests.report.browser import Browser, chromium
@@ -25,6 +26,8 @@ _SORTED = "document.querySelector('#sort-steps button').click();"
 
 
 def main(arguments: list[str]) -> None:
+    if not [name for name in arguments if not name.isdigit()] or asks_for_help(arguments):
+        raise SystemExit(__doc__)
     count = int(arguments[-1]) if arguments[-1].isdigit() else 700
     runs = [run_data(load_run(Path(name)), "all") for name in arguments if not name.isdigit()]
     many = [dataclasses.replace(run, episodes=()) for run in runs]

@@ -22,12 +22,12 @@ from pathlib import Path
 import numpy as np
 
 from data.records import ACTIONS, ActionKind, PlanStep
-from data.shards import ShardReader, decode_png
+from data.shards import ShardError, ShardReader, decode_png
 from proprio_mllm.planners.chat.embedding import SentenceEmbedder
 from proprio_mllm.planners.chat.recall import Key, MomentRecall, TaskRecall, load_moments
 from proprio_mllm.planners.chat.sight import ImageEncoder
 from proprio_mllm.planners.chat.spoken import step_words, type_words
-from proprio_mllm.planners.memory import MemoryEpisode, read_memory
+from proprio_mllm.planners.memory import MemoryEpisode, MemoryFileError, read_memory
 from proprio_mllm.planners.memory_build import Candidate, candidates
 
 
@@ -106,13 +106,19 @@ def main() -> int:
     parser.add_argument("demos", type=Path)
     parser.add_argument("--views", type=int, default=600)
     args = parser.parse_args()
-    reader = ShardReader(args.demos, "demos")
+    if args.views < 2:
+        parser.error(f"--views {args.views} must be at least 2")
+    try:
+        reader, memory = ShardReader(args.demos, "demos"), read_memory(args.memory)
+    except (ShardError, MemoryFileError) as error:
+        parser.error(str(error))
     began = time.perf_counter()
     embedder = SentenceEmbedder()
     loaded = time.perf_counter()
-    memory = read_memory(args.memory)
     known = {one.task for one in memory.episodes} | {one.instruction for one in memory.episodes}
     asked = [one for one in candidates(reader) if not known & {one.episode.task, one.episode.instruction}]
+    if not asked:
+        parser.error(f"every demonstration of {args.demos} is in the memory {args.memory}: none is left to ask about")
     fresh = list(dict.fromkeys(one.episode.instruction for one in asked))[:200]
     start = time.perf_counter()
     for text in fresh:

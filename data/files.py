@@ -55,7 +55,11 @@ def write_cached(name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a UTF-8 text file."""
+    """Writes a UTF-8 text file; into a device or a pipe, such as /dev/stdout, it writes without replacing it."""
+    if path.exists() and not path.is_file() and not path.is_dir():
+        with path.open("wb") as stream:
+            stream.write(text.encode())
+        return
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     temporary.write_bytes(text.encode())
     os.replace(temporary, path)

@@ -19,6 +19,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from configs.help import asks_for_help
 from data.generator import generate_clip
 from data.metrics import Metrics, evaluate
 from data.omomo import find_demo_clips, level_parts, load_mocap, load_omomo
@@ -109,11 +110,17 @@ def table(columns: Sequence[Column]) -> Table:
     return out
 
 
+_USAGE: Final = "usage: python -m data.retarget report [number of generated clips, 72 by default] [--physics]\n"
+
+
 def main(arguments: Sequence[str]) -> int:
     """Command line; prints the table, or what is allowed."""
+    if asks_for_help(arguments):
+        sys.stdout.write(f"{(__doc__ or '').strip()}\n\n{_USAGE}")
+        return 0
     words = [word for word in arguments if word != "--physics"]
     if not words or words[0] != "report" or len(words) > 2 or not all(a.isdigit() for a in words[1:]):
-        sys.stderr.write("usage: python -m data.retarget report [number of generated clips, 72 by default] [--physics]\n")
+        sys.stderr.write(_USAGE)
         return 2
     count = max(1, int(words[1])) if len(words) == 2 else 72
     physics = "--physics" in arguments

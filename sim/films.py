@@ -1,4 +1,4 @@
-"""A film of each skill by each robot, and a strip of stills beside it, for the eye: `python -m sim.films [folder]`.
+"""A film of each skill by each robot, and a strip of stills beside it, for the eye: `python -m sim.films [folder] [scene ...]`.
 
 Where only the pelvis height is wrong for a step it is put right first, as the failure's margin says. Not part of any
 experiment.
@@ -6,6 +6,7 @@ experiment.
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -142,4 +143,11 @@ def main(folder: Path, names: Sequence[str] = tuple(SCENES)) -> int:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "outputs/films"), sys.argv[2:] or tuple(SCENES))
+    parser = argparse.ArgumentParser("python -m sim.films", description=__doc__)
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("outputs/films"))
+    parser.add_argument("scene", nargs="*", help=f"of {', '.join(SCENES)}; all by default")
+    arguments = parser.parse_args()
+    unknown = [name for name in arguments.scene if name not in SCENES]
+    if unknown:
+        parser.error(f"there is no scene {unknown[0]!r}; allowed: {', '.join(SCENES)}")
+    main(arguments.folder, arguments.scene or tuple(SCENES))

@@ -6,7 +6,7 @@ standing, crouching and holding a plant with both hands. Not part of any experim
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -129,5 +129,7 @@ def main(folder: Path) -> list[Path]:
 
 
 if __name__ == "__main__":
-    for written in main(Path(sys.argv[1] if len(sys.argv) > 1 else "outputs/look")):
+    parser = argparse.ArgumentParser("python -m sim.look", description=__doc__)
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("outputs/look"))
+    for written in main(parser.parse_args().folder):
         print(written)  # noqa: T201 this is what the command is for

@@ -7,7 +7,7 @@ Paper: none; to look at what the numbers cannot show.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -120,4 +120,8 @@ def main(numbers: list[int], folder: Path) -> list[Path]:
 
 
 if __name__ == "__main__":
-    main([int(argument) for argument in sys.argv[1:]] or [0, 8, 12], Path("outputs/look"))
+    parser = argparse.ArgumentParser(
+        "python -m sim.motion_look", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("numbers", nargs="*", type=int, default=[0, 8, 12])
+    main(parser.parse_args().numbers, Path("outputs/look"))

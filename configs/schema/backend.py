@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
 __all__ = ["BackendConfig", "BackendKind"]
 
 BackendKind = Literal["openai", "local", "replay", "scripted"]
+#: Fields that not every kind uses; elsewhere they keep their defaults, so that none is ignored. `replay` names what was asked.
+_OF_KINDS: Final[Mapping[str, tuple[BackendKind, ...]]] = {
+    "base_url": ("openai", "replay"),
+    "timeout_s": ("openai", "replay"),
+    "retries": ("openai", "replay"),
+    "structured": ("openai", "replay"),
+    "token_limit_field": ("openai", "replay"),
+    "device": ("local", "replay"),
+    "dtype": ("local", "replay"),
+    "batch": ("local", "replay"),
+    "constrained": ("local", "replay"),
+}
 #: Longest wait, a day; the system's clock takes no endless one.
 _LONGEST_S: Final = 86_400.0
 
@@ -72,6 +85,12 @@ class BackendConfig:
         _require(self.name.isidentifier(), f"backend name {self.name!r} must be an identifier")
         _require(bool(self.model) or self.kind == "scripted", f"backend kind {self.kind!r} needs a model, got ''")
         _require((self.source is not None) == (self.kind == "scripted"), f"kind {self.kind!r} with source {self.source!r}")
+        for name, kinds in _OF_KINDS.items():
+            default = self.__dataclass_fields__[name].default
+            _require(
+                self.kind in kinds or getattr(self, name) == default,
+                f"kind {self.kind!r} with {name} {getattr(self, name)!r}; allowed: {default!r}, others with {', '.join(kinds)}",
+            )
         # not shown: whoever gives something else gives the key
         _require(self.key_env.isidentifier(), "key_env is the name of an environment variable; a key itself is never an option")
         _require(self.kind != "replay" or self.cache is not None, "backend kind 'replay' needs a cache, got null")

@@ -41,6 +41,7 @@ _OF_KINDS: Final[Mapping[str, tuple[PlannerKind, ...]]] = {
     "body": (*CHAT_KINDS, "file"),
     "horizon": ("plain", "file"),
     "parallel": ("dag_plan",),
+    "image_size": ("random", "scripted", "expert"),
 }
 ExperimentName = Literal["main_table", "ablation_table", "replanning_table", "failure_figure", "distribution_figures"]
 
@@ -66,7 +67,8 @@ class PlannerConfig:
         train: command that makes the weights, for the message when they are absent.
         temperature: 0 takes the most likely token.
         max_new_tokens: longest reply.
-        image_size: side of the head view in pixels for planners that bring no model; a model or a backend brings its own.
+        image_size: side of the head view in pixels for `random`, `scripted` and `expert`; others bring their own, or have
+            `backend.image_size`.
         reflection: `on` reflects on failures. Planners of a backend ask once more for cause, change and new steps; a stored
             model reads its failed steps in the log, which `off` leaves out.
         replans: most re-plans, reflecting or not, of an episode.
@@ -103,6 +105,7 @@ class PlannerConfig:
         _require((self.source is not None) == (self.kind == "file"), f"kind {self.kind!r} with source {self.source!r}")
         _require(self.temperature >= 0.0, f"temperature {self.temperature} must not be negative")
         _require(self.max_new_tokens > 0, f"max_new_tokens {self.max_new_tokens} must be positive")
+        _require(32 <= self.image_size <= 2048, f"image_size {self.image_size} outside [32, 2048]")
         for name, low in (("replans", 0), ("horizon", 1), ("history", 1), ("examples", 0)):
             _require(getattr(self, name) >= low, f"{name} {getattr(self, name)} must be at least {low}")
         needs = self.kind in ("llm_planner", "rap")
@@ -212,11 +215,11 @@ class EvalConfig:
             (self.reflection == "on" and self.planner.reflection == "on") or asks or self.planner.kind == "mllm",
             f"reflection 'off' with planner kind {self.planner.kind!r}, which has none; allowed: on",
         )
-        _require(self.backend is not None or not chats, f"planner {self.planner.name!r} needs a backend, got null")
+        _require(self.backend is not None or not chats, f"planner {self.planner.name!r} needs a backend; allowed: backend=NAME")
         _require(
             self.backend is None or asks,
             f"backend {self.backend.name if self.backend else ''!r} with planner kind {self.planner.kind!r}, which asks none; "
-            f"allowed: null, or a planner of kind {', '.join(CHAT_KINDS)}, file",
+            f"allowed: none, or a planner of kind {', '.join(CHAT_KINDS)}, file",
         )
         for name in ("replans", "history", "body", "horizon") if self.planner.kind == "file" and not asks else ():
             value, default = getattr(self.planner, name), PlannerConfig.__dataclass_fields__[name].default
@@ -236,6 +239,10 @@ class EvalConfig:
         )
         cap = self.cost_cap_usd
         _require(cap is None or 0.0 <= cap < math.inf, f"cost_cap_usd {cap} must be null or a finite number of at least 0")
+        _require(
+            cap is None or asks,
+            f"cost_cap_usd {cap} with planner kind {self.planner.kind!r}, which asks no backend; allowed: null",
+        )
         _require(self.limit is None or self.limit > 0, f"limit {self.limit} must be positive or null")
         _require(self.retries >= 0, f"retries {self.retries} must not be negative")
         _require(self.seed >= 0, f"seed {self.seed} must not be negative")

@@ -49,7 +49,7 @@ def make_backend(cfg: BackendConfig, run: Path | None, cap_usd: float | None = N
     check_cap(cfg, cap_usd)
     price = None if cfg.price is None else price_of(cfg.price)
     if price is not None and cfg.model not in price.models:
-        logger.warning("backend %s: model %s is priced as %s", cfg.name, cfg.model, cfg.price)
+        logger.warning("backend %s: model %s is priced as %s", cfg.name, cfg.model or "of no name", cfg.price)
     backend = _model(cfg)
     try:
         if price is not None:

@@ -28,6 +28,8 @@ _PAPER_NOTE: Final = "paper: printed in the paper, another simulator and a 7B mo
 
 #: A model and its cells: the run to show, if there is one, and the category.
 _Row = tuple[str | None, list[tuple[Run | None, str]]]
+#: Runs that a note names.
+_NAMED: Final = 6
 _COSTS: Final = ("invalid %", "broken", "calls", "tokens", "USD", "model")
 
 
@@ -99,6 +101,26 @@ def _filled(rows: Sequence[_Row]) -> Sequence[_Row]:
     return [row for row in rows if any(run is not None for run, _ in row[1])] or [(None, rows[0][1])]
 
 
+def _left_out(
+    cfg: ExperimentConfig,
+    difficulties: Sequence[str],
+    robots: Sequence[str],
+    runs: Sequence[Run],
+    shown: Sequence[Run | None],
+) -> tuple[str, ...]:
+    """What to know of runs of these planners, robots and difficulties that fill no cell."""
+    folders = {run.folder for run in shown if run is not None}
+    asked = [run for run in runs if run.metadata["planner"] in cfg.planners and run.folder not in folders]
+    titles = [run.title for run in asked if run.metadata["robot"] in robots and run.metadata["difficulty"] in difficulties]
+    if not titles:
+        return ()
+    more = f" and {len(titles) - _NAMED} more" if len(titles) > _NAMED else ""
+    return (
+        f"Not shown, since they are over a part of the tasks, with other settings, of a script, or older or smaller than "
+        f"a run that is shown: {'; '.join(titles[:_NAMED])}{more}.",
+    )
+
+
 def _own_row(title: str, cells: Sequence[tuple[Run | None, str]]) -> tuple[str, ...]:
     """A row of ours from (run, category) per cell."""
     shown = [run for run, _ in cells if run is not None]
@@ -115,11 +137,13 @@ def main_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
     places = [(category, robot) for category in _CATEGORIES for robot in cfg.robots]
     difficulty, paper = cfg.difficulties[0], dict(paper_main())
     body: list[tuple[str, ...]] = []
+    shown: list[Run | None] = []
     for name in cfg.planners:
         rows = [
             (model, [(newest(runs, name, robot, difficulty, category, model=model), category) for category, robot in places])
             for model in _models(runs, name)
         ]
+        shown += [run for _, cells in rows for run, _ in cells]
         body += [_own_row(_title(name, model), cells) for model, cells in _filled(rows)]
         method = PAPER_ROWS.get(name, (None, None, None))[0]
         if method is not None:
@@ -131,6 +155,7 @@ def main_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
         "tokens, USD: means per episode; invalid: share of calls; broken: attempts that failed for reasons outside the "
         "planner, run again and not scored.",
         _PAPER_NOTE,
+        *_left_out(cfg, (difficulty,), cfg.robots, runs, shown),
     )
     return Table(f"Success by category ({difficulty})", columns, tuple(body), notes)
 
@@ -139,6 +164,7 @@ def replanning_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
     """Success at each difficulty on dual-arm essential tasks, with reflection and without."""
     robot, paper = cfg.robots[0], dict(paper_replanning())
     body: list[tuple[str, ...]] = []
+    shown: list[Run | None] = []
     for name in cfg.planners:
         method = PAPER_ROWS.get(name, (None, None, None))[1]
         reflects = _planner(name).get("kind") in ("mllm", *CHAT_KINDS)
@@ -153,6 +179,7 @@ def replanning_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
                 )
                 for model in _models(runs, name)
             ]
+            shown += [run for _, cells in rows for run, _ in cells]
             body += [_own_row(f"{_title(name, model)}{suffix}", cells) for model, cells in _filled(rows)]
             values = paper.pop(f"{method}{suffix}", None)
             if values is not None:
@@ -163,6 +190,7 @@ def replanning_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
         "Low-level skills succeed in 100 % (easy), 50 % (medium), 20 % (hard) of the cases. Without reflection: see "
         "docs/planners.md for what each planner then leaves out.",
         _PAPER_NOTE,
+        *_left_out(cfg, cfg.difficulties, (robot,), runs, shown),
     )
     return Table(f"Re-planning, dual-arm essential, {robot}", columns, tuple(body), notes)
 
@@ -172,8 +200,10 @@ def ablation_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
     robot, difficulty = cfg.robots[0], cfg.difficulties[0]
     paper = paper_ablation()
     body: list[tuple[str, ...]] = []
+    shown: list[Run | None] = []
     for name in cfg.planners:
         run = newest(runs, name, robot, difficulty, "essential")
+        shown.append(run)
         row = None if run is None else run.row("essential")
         own = (
             ("", "", "", "")
@@ -188,7 +218,8 @@ def ablation_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
         body.append((_label(name), *own, *printed))
     kinds = ("success", "navigation", "body adj.", "logical")
     columns = ("planner", *kinds, *(f"paper {kind}" for kind in kinds))
-    notes = ("The paper counts failures over 133 tasks x 50 trials.", _PAPER_NOTE)
+    left_out = _left_out(cfg, (difficulty,), (robot,), runs, shown)
+    notes = ("The paper counts failures over 133 tasks x 50 trials.", _PAPER_NOTE, *left_out)
     return Table(f"Ablation, dual-arm essential, {robot}, {difficulty}", columns, tuple(body), notes)
 
 

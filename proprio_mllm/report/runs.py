@@ -9,7 +9,7 @@ from data.files import write_text
 from proprio_mllm.backends.making import SPENDING_FILE
 from proprio_mllm.backends.protocol import BackendError
 from proprio_mllm.backends.spending import Spending
-from proprio_mllm.evaluation.naming import options_of
+from proprio_mllm.evaluation.naming import as_published
 from proprio_mllm.report.references import references_of
 from proprio_mllm.report.stored import Run, find_runs, load_run
 from proprio_mllm.report.summary import SUMMARY_VERSION, Row, write_json
@@ -106,8 +106,8 @@ def newest(
 ) -> Run | None:
     """The run to show in a cell: of these settings, the one with most episodes of the category, then the newest.
 
-    Runs over a part of the tasks (`limit`, `split`), from other start poses, with other rules of luck, with a planner's `body`,
-    `horizon` or `parallel` off their defaults, or with a script in place of a model are left out.
+    Runs over a part of the tasks (`limit`, `split`), from other start poses, with other rules of luck, with a planner or a
+    backend set otherwise than in its file (`as_published`), or with a script in place of a model are left out.
 
     Args:
         runs: the newest first.
@@ -126,7 +126,7 @@ def newest(
         and run.metadata["category"] in ("all", category)
         and (run.metadata.get("split", "all"), run.metadata.get("reflection", "on")) == ("all", reflection)
         and not run.machinery
-        and not {"body", "one_node", "horizon"} & {option.rstrip("0123456789") for option in options_of(run.metadata["config"])}
+        and as_published(run.metadata["config"])
         and run.metadata.get("contingencies", "default") == "default"
         and model in (None, run.backend.get("model", ""))
     ]

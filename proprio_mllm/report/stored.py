@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from pydantic import BaseModel, ConfigDict, ValidationError
+
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.ledger import read_ledger
 from proprio_mllm.evaluation.naming import options_of
@@ -16,11 +18,45 @@ from proprio_mllm.report.summary import CATEGORIES, Row, rows_of
 
 __all__ = ["Run", "find_runs", "load_run", "read_metadata"]
 
-#: What every report reads of `run.json`.
-_NEEDED: Final = (
-    "planner", "label", "privileged", "robot", "difficulty", "config_hash", "command", "weights", "weights_digest", "tasks",
-    "trials", "category", "limit", "start", "seed", "planned", "config",
-)  # fmt: skip
+#: Faults of a file that a message names.
+_TOLD: Final = 5
+
+
+class _Config(BaseModel):
+    """Of the run's configuration, what reports look into."""
+
+    model_config = ConfigDict(extra="allow")
+
+    planner: dict[str, Any] = {}
+    robot: dict[str, Any] = {}
+    backend: dict[str, Any] | None = None
+    tasks: str = "benchmark"
+    contingencies: str = "default"
+
+
+class _Metadata(BaseModel):
+    """What every report reads of `run.json`."""
+
+    model_config = ConfigDict(extra="allow")
+
+    planner: str
+    label: str
+    privileged: bool
+    robot: str
+    difficulty: str
+    config_hash: str
+    command: str
+    weights: str | None
+    weights_digest: str
+    tasks: str
+    trials: int
+    category: str
+    limit: int | None
+    start: str
+    seed: int
+    planned: list[tuple[str, str, int, str]]
+    config: _Config
+    backend: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,9 +153,11 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     version = metadata.get("version") if isinstance(metadata, dict) else None
     if version != 1:
         raise ValueError(f"{path}: run version {version!r} is unknown; this code reads 1")
-    missing = [name for name in _NEEDED if name not in metadata]
-    if missing:
-        raise ValueError(f"{path}: damaged, it lacks {', '.join(missing)}")
+    try:
+        _Metadata.model_validate(metadata)
+    except ValidationError as error:
+        told = (f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:_TOLD])
+        raise ValueError(f"{path}: damaged: {'; '.join(told)}") from error
     return metadata
 
 

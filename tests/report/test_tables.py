@@ -166,10 +166,13 @@ def test_a_run_over_a_part_of_the_tasks_makes_no_row(tmp_path, run) -> None:
     assert [row[0] for row in table.rows if row[1] == "ours"] == ["DAG-Plan (base)"]
 
 
-@pytest.mark.parametrize("changed", [{"body": True}, {"parallel": False}, {"horizon": 3}])
+@pytest.mark.parametrize("changed", [{"body": True}, {"parallel": False}, {"replans": 1}, {"history": 3}])
 def test_a_planner_with_other_options_fills_no_cell(tmp_path, run, changed: dict) -> None:
-    run(tmp_path, "dag_plan", "h1", config={"planner": changed})
+    run(tmp_path, "dag_plan", "h1", config={"planner": {"name": "dag_plan", **changed}})
     assert newest(find_runs(tmp_path), "dag_plan", "h1", "easy") is None
+    table = main_table(ExperimentConfig("main_table", ("dag_plan",)), find_runs(tmp_path))
+    assert table.notes[-1].startswith("Not shown")
+    assert find_runs(tmp_path)[0].title in table.notes[-1]
     run(tmp_path / "other", "dag_plan", "h1", contingencies="unlucky")
     assert newest(find_runs(tmp_path / "other"), "dag_plan", "h1", "easy") is None
     run(tmp_path / "plain", "dag_plan", "h1", config={"planner": {"horizon": 1}})
