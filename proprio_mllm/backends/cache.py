@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from configs.schema.backend import BackendConfig
-from proprio_mllm.backends.identity import identity_of
+from proprio_mllm.backends.identity import identity_in_words, identity_of
 from proprio_mllm.backends.protocol import Backend, BackendError, BackendSetupError, ChatReply, ChatRequest
 from proprio_mllm.backends.replies import ReplyStore, question_of
 from proprio_mllm.backends.transcripts import main
@@ -135,10 +135,11 @@ class ReplayBackend:
             asked = next((message.text for message in reversed(request.messages) if message.role == "user"), "")
             start = " ".join(asked.split())[:_SHOWN_CHARACTERS]
             others = self._store.count(self.identity)
-            held = "" if others else "; it holds replies of: " + (", ".join(self._store.identities()[:_SHOWN_OTHERS]) or "none")
+            named = map(identity_in_words, self._store.identities()[:_SHOWN_OTHERS])
+            held = "" if others else "; it holds replies of: " + (", ".join(named) or "none")
             raise (BackendError if others else BackendSetupError)(
                 f"{self._store.path} holds no reply to the {request.purpose!r} request {key[:12]} that begins {start!r}"
-                f" (of its backend, {self.identity}, it holds {others}{held})"
+                f" (of its backend, {identity_in_words(self.identity)}, it holds {others}{held})"
             )
         return found
 

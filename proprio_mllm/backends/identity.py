@@ -8,11 +8,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Final
 
 from configs.schema.backend import BackendConfig
 from data.code_files import source_digest
 
-__all__ = ["identity_of"]
+__all__ = ["identity_in_words", "identity_of"]
+
+#: What needs no words.
+_USUAL: Final = {"revision": "", "structured": "json_schema", "dtype": "auto", "constrained": False}
 
 
 def identity_of(cfg: BackendConfig) -> str:
@@ -33,6 +37,24 @@ def identity_of(cfg: BackendConfig) -> str:
             "constrained": cfg.constrained,
         }
     )
+
+
+def identity_in_words(identity: str) -> str:
+    """An identity for messages: `backend.model=gpt-4o backend.structured=off`, or as it is when it is no such JSON."""
+    try:
+        values = json.loads(identity)
+    except ValueError:
+        return identity
+    if not isinstance(values, dict):
+        return identity
+    if "script" in values:
+        return f"a script of digest {values['script']}"
+    told = (f"backend.{name}={_option(value)}" for name, value in values.items() if _USUAL.get(name, ...) != value)
+    return " ".join(sorted(told, key=lambda one: not one.startswith("backend.model")))
+
+
+def _option(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _known_as(cfg: BackendConfig) -> str:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import time
+import traceback
+from pathlib import Path
 
 from configs.schema.backend import BackendConfig
 from data.code_files import CodeFileError, load_named
@@ -15,6 +17,12 @@ from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import BackendError, BackendSetupError, ChatReply, ChatRequest
 
 __all__ = ["ScriptedChat"]
+
+
+def _line(error: Exception) -> str:
+    """Where an error came up."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return f" at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
 
 
 class ScriptedChat:
@@ -50,7 +58,7 @@ class ScriptedChat:
         except BackendError:
             raise
         except Exception as error:
-            raise BackendError(f"{self._source} failed: {type(error).__name__}: {error}") from error
+            raise BackendError(f"{self._source} failed{_line(error)}: {type(error).__name__}: {error}") from error
         latency_s = time.perf_counter() - start
         if isinstance(answer, str):
             return ChatReply(answer, latency_s=latency_s, model="script")

@@ -343,8 +343,10 @@ def _planner(setup: WorkerSetup) -> Planner:
         return ExpertPlanner(setup.planner.image_size)
     if setup.planner.kind == "mllm":
         import torch
+        from transformers.utils import logging as transformers_logging
 
         torch.set_num_threads(1)
+        transformers_logging.disable_progress_bar()  # bars of several processes would run across the run's own
     return make_planner(setup.planner)
 
 

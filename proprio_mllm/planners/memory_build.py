@@ -242,6 +242,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     families = {episode.family for episode in memory.episodes}
     robots = Counter(episode.robot for episode in memory.episodes)
     steps = sum(len(episode.steps) for episode in memory.episodes)
-    facts = f"{len(memory.episodes)} episodes, {steps} steps, {len(families)} families, {dict(sorted(robots.items()))}"
+    found = f"{len(memory.episodes)} episodes, one of each instruction"
+    facts = f"{found}, {steps} steps, {len(families)} families, {dict(sorted(robots.items()))}"
     sys.stdout.write(f"{config.out}: {facts}\n")
     return 0

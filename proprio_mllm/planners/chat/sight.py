@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 import configs
 from data.files import file_hash
+from proprio_mllm.planners.chat.embedding import without_bar
 
 __all__ = ["ImageEncoder", "SightError", "image_encoder", "weights_digest"]
 
@@ -107,7 +108,8 @@ def _checkpoint(path: Path) -> Callable[[NDArray[np.uint8]], Any]:
     from transformers import AutoImageProcessor, AutoModel
 
     processor: Any = AutoImageProcessor.from_pretrained(str(path), local_files_only=True)
-    model: Any = AutoModel.from_pretrained(str(path), local_files_only=True).eval()
+    with without_bar():
+        model: Any = AutoModel.from_pretrained(str(path), local_files_only=True).eval()
     if not hasattr(model, "get_image_features"):
         raise SightError(f"{path}: {type(model).__name__} has no get_image_features; allowed: CLIP, SigLIP and their like")
     return lambda image: model.get_image_features(**processor(images=[image], return_tensors="pt")).pooler_output[0]
