@@ -98,8 +98,13 @@ def read_completion(body: bytes, content_type: str | None) -> ChatReply:
         prompt_tokens=prompt_tokens,
         completion_tokens=completion_tokens,
         finish_reason="refusal" if choice.message.refusal else _FINISHED.get(finished, "stop"),
-        model=shown_name(" ".join(name for name in (completion.model, completion.system_fingerprint) if name)),
+        model=shown_name(_answered(completion.model or "", completion.system_fingerprint or "")),
     )
+
+
+def _answered(model: str, fingerprint: str) -> str:
+    """Model and exact revision; a fingerprint that names the model, as this project's server gives it, says both."""
+    return fingerprint if fingerprint.startswith(f"{model}@") else f"{model} {fingerprint}".strip()
 
 
 def read_usage(usage: object) -> tuple[int, int]:

@@ -105,6 +105,7 @@ class OpenAIChat:
         if reply.prompt_tokens == 0 and reply.finish_reason != "refusal":
             logger.warning("backend %s: a reply without usable token counts", self._cfg.name)
         text, model = self._secret.redact(reply.text), self._secret.redact(reply.model)
+        self._same_weights(model)
         return dataclasses.replace(reply, text=text, model=model, latency_s=latency_s)
 
     def revision(self) -> str | None:
@@ -127,6 +128,15 @@ class OpenAIChat:
         """Closes its connections."""
         self._client.close()
         self._secret.release()
+
+    def _same_weights(self, answered: str) -> None:
+        """Refuses a reply of other weights than the run is known by, as after a restart of the server in its midst."""
+        model, _, revision = answered.rpartition("@")
+        if self._own_machine and self._cfg.revision and model == self._cfg.model and revision != self._cfg.revision:
+            raise BackendSetupError(
+                f"backend {self._cfg.name}: {self._client.base_url} answers as {answered}, and this run is of revision"
+                f" {self._cfg.revision}; serve those weights, or start the command again"
+            )
 
     def _asked(self, body: dict[str, Any]) -> ChatReply | BackendError:
         try:

@@ -55,6 +55,17 @@ def test_a_reply(cfg: BackendConfig, server: LoopbackServer) -> None:
     assert isinstance(OpenAIChat(cfg), Backend)
 
 
+def test_other_weights_in_the_midst_of_a_run(cfg: BackendConfig, server: LoopbackServer) -> None:
+    known = dataclasses.replace(cfg, model="served-model", revision="abc")
+    server.answer = lambda handler: handler.send(200, completion("Wait()", system_fingerprint="served-model@abc"))
+    assert reply_of(known).model == "served-model@abc"
+    server.answer = lambda handler: handler.send(200, completion("Wait()", system_fingerprint="served-model@def"))
+    assert reply_of(cfg).model == "served-model@def"
+    error = error_of(known)
+    assert isinstance(error, BackendSetupError)
+    assert "answers as served-model@def, and this run is of revision abc" in str(error)
+
+
 def test_what_is_sent(cfg: BackendConfig, server: LoopbackServer) -> None:
     request = ask(schema=Steps, max_tokens=77, temperature=0.5)
     reply_of(cfg, request)
