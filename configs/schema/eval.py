@@ -105,7 +105,7 @@ class PlannerConfig:
         _require((self.source is not None) == (self.kind == "file"), f"kind {self.kind!r} with source {self.source!r}")
         _require(self.temperature >= 0.0, f"temperature {self.temperature} must not be negative")
         _require(self.max_new_tokens > 0, f"max_new_tokens {self.max_new_tokens} must be positive")
-        _require(32 <= self.image_size <= 2048, f"image_size {self.image_size} outside [32, 2048]")
+        _require(16 <= self.image_size <= 2048, f"image_size {self.image_size} outside [16, 2048]")
         for name, low in (("replans", 0), ("horizon", 1), ("history", 1), ("examples", 0)):
             _require(getattr(self, name) >= low, f"{name} {getattr(self, name)} must be at least {low}")
         needs = self.kind in ("llm_planner", "rap")

@@ -28,9 +28,11 @@ def command() -> Iterator[subprocess.Popen[str]]:
     """The command, on a free port."""
     call = [sys.executable, "-m", "proprio_mllm.backends.serve", "port=0", "device=cpu"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs, and so theirs, ignore it
     with subprocess.Popen(
         call, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
+        signal.signal(signal.SIGINT, before)
         try:
             yield process
         finally:

@@ -80,7 +80,7 @@ def test_an_output_that_cannot_be_written_is_one_message(
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [("{", "not JSON"), ("[]", "run version None is unknown"), ('{"version": 1}', "damaged, it lacks planner, label")],
+    [("{", "not JSON"), ("[]", "run version None is unknown"), ('{"version": 1}', "damaged: planner: Field required; label")],
 )
 def test_a_damaged_run_is_named(content: str, said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / "eval" / "gpt4o-h1" / "run.json"
