@@ -31,6 +31,7 @@ from configs.validate import build
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.planners.memory import MemoryFileError, check_memory
+from sim.robots.spec import available_robots
 from sim.tasks.certificates import load_certificates
 from sim.tasks.task import Task, load_benchmark, write_tasks
 
@@ -104,7 +105,7 @@ def scheduling(robot: str, count: int, folder: Path, memory: str) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", type=int, default=20)
-    parser.add_argument("--robot", default="h1", choices=("h1", "x1"))
+    parser.add_argument("--robot", default="h1", choices=available_robots())
     parser.add_argument("--mistakes", type=float, default=0.15)
     parser.add_argument("--memory", default="outputs/memory")
     parser.add_argument("--planners", default=",".join(PLANNERS))

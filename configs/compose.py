@@ -6,11 +6,13 @@ wrong group value or key stops here with the allowed ones; a wrong value of a pl
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -21,7 +23,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from configs.assets import own_files
 from configs.validate import ConfigError
 
-__all__ = ["CONFIG_DIR", "compose", "groups"]
+__all__ = ["CONFIG_DIR", "compose", "group_file", "groups"]
 
 CONFIG_DIR = Path(__file__).resolve().parent
 #: Of these groups fields can be set that the group's file leaves at their defaults.
@@ -36,6 +38,13 @@ def groups() -> dict[str, tuple[str, ...]]:
         if names:
             found[folder.name] = names
     return found
+
+
+@functools.cache
+def group_file(group: str, name: str) -> dict[str, Any]:
+    """A group's file as it is written, nothing composed; empty when there is no such file."""
+    path = CONFIG_DIR / group / f"{name}.yaml"
+    return yaml.safe_load(path.read_text(encoding="utf-8")) if name.isidentifier() and path.is_file() else {}
 
 
 def compose(root: str, overrides: Sequence[str] = ()) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import sys
 import textwrap
 import typing
 from collections.abc import Iterator, Mapping
@@ -16,7 +17,7 @@ import yaml
 
 from configs.compose import CONFIG_DIR, compose, groups
 
-__all__ = ["asks_for_help", "help_text", "tool_help"]
+__all__ = ["asks_for_help", "help_text", "shows_help", "tool_help"]
 
 _WIDTH: Final = 110
 #: Stands for a field that has no default.
@@ -27,6 +28,14 @@ _ENTRY: Final = re.compile(r"^(\w+(?:, \w+)*): (.*)$")
 def asks_for_help(arguments: typing.Sequence[str]) -> bool:
     """Whether `-h` or `--help` is among the arguments."""
     return any(argument in ("-h", "--help") for argument in arguments)
+
+
+def shows_help(arguments: typing.Sequence[str], text: str | None) -> bool:
+    """Prints a text, such as a module's docstring, when help is asked for; whether it was."""
+    asked = asks_for_help(arguments)
+    if asked:
+        sys.stdout.write(f"{(text or '').strip()}\n")
+    return asked
 
 
 def help_text(root: str, schema: type, about: str) -> str:

@@ -17,7 +17,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from configs.help import asks_for_help
+from configs.help import shows_help
 from data.filter import GATES, phc_list, reason_group
 from data.humanml3d import DatasetError, list_clips
 from data.shards import Manifest, ShardError
@@ -117,8 +117,7 @@ def _add(table: Table, name: str, *values: int | str) -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 1 when the folder holds neither, 2 on wrong arguments."""
-    if asks_for_help(arguments):
-        sys.stdout.write(f"{(__doc__ or '').strip()}\n")
+    if shows_help(arguments, __doc__):
         return 0
     if len(arguments) != 2 or arguments[0] != "table":
         sys.stderr.write(_USAGE)

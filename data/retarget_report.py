@@ -19,7 +19,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from configs.help import asks_for_help
+from configs.help import shows_help
 from data.generator import generate_clip
 from data.metrics import Metrics, evaluate
 from data.omomo import find_demo_clips, level_parts, load_mocap, load_omomo
@@ -29,6 +29,8 @@ from data.tracking import Tracker, Tracking
 from sim.robots.spec import available_robots, load_robot
 
 __all__ = ["PHYSICS", "TARGETS", "Column", "main", "measure", "table"]
+
+_USAGE: Final = "usage: python -m data.retarget report [number of generated clips, 72 by default] [--physics]\n"
 
 #: Metric, its heading and what the project aims at.
 TARGETS: Final = {
@@ -110,13 +112,9 @@ def table(columns: Sequence[Column]) -> Table:
     return out
 
 
-_USAGE: Final = "usage: python -m data.retarget report [number of generated clips, 72 by default] [--physics]\n"
-
-
 def main(arguments: Sequence[str]) -> int:
     """Command line; prints the table, or what is allowed."""
-    if asks_for_help(arguments):
-        sys.stdout.write(f"{(__doc__ or '').strip()}\n\n{_USAGE}")
+    if shows_help(arguments, f"{__doc__}\n{_USAGE}"):
         return 0
     words = [word for word in arguments if word != "--physics"]
     if not words or words[0] != "report" or len(words) > 2 or not all(a.isdigit() for a in words[1:]):

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
+from configs.schema.checks import require, require_used
+
 __all__ = ["BackendConfig", "BackendKind"]
 
 BackendKind = Literal["openai", "local", "replay", "scripted"]
@@ -23,11 +25,6 @@ _OF_KINDS: Final[Mapping[str, tuple[BackendKind, ...]]] = {
 }
 #: Longest wait, a day; the system's clock takes no endless one.
 _LONGEST_S: Final = 86_400.0
-
-
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise ValueError(message)
 
 
 @dataclass(frozen=True)
@@ -82,22 +79,17 @@ class BackendConfig:
     cache: str | None = "outputs/replies.sqlite"
 
     def __post_init__(self) -> None:
-        _require(self.name.isidentifier(), f"backend name {self.name!r} must be an identifier")
-        _require(bool(self.model) or self.kind == "scripted", f"backend kind {self.kind!r} needs a model, got ''")
-        _require((self.source is not None) == (self.kind == "scripted"), f"kind {self.kind!r} with source {self.source!r}")
-        for name, kinds in _OF_KINDS.items():
-            default = self.__dataclass_fields__[name].default
-            _require(
-                self.kind in kinds or getattr(self, name) == default,
-                f"kind {self.kind!r} with {name} {getattr(self, name)!r}; allowed: {default!r}, others with {', '.join(kinds)}",
-            )
+        require(self.name.isidentifier(), f"backend name {self.name!r} must be an identifier")
+        require(bool(self.model) or self.kind == "scripted", f"backend kind {self.kind!r} needs a model, got ''")
+        require((self.source is not None) == (self.kind == "scripted"), f"kind {self.kind!r} with source {self.source!r}")
+        require_used(self, _OF_KINDS)
         # not shown: whoever gives something else gives the key
-        _require(self.key_env.isidentifier(), "key_env is the name of an environment variable; a key itself is never an option")
-        _require(self.kind != "replay" or self.cache is not None, "backend kind 'replay' needs a cache, got null")
-        _require(0.0 < self.timeout_s <= _LONGEST_S, f"timeout_s {self.timeout_s} outside (0, {_LONGEST_S:g}]")
-        _require(0 <= self.retries <= 20, f"retries {self.retries} outside [0, 20]")
-        _require(1 <= self.concurrency <= 1024, f"concurrency {self.concurrency} outside [1, 1024]")
-        _require(self.max_tokens > 0, f"max_tokens {self.max_tokens} must be positive")
-        _require(0.0 <= self.temperature <= 2.0, f"temperature {self.temperature} outside [0, 2]")
-        _require(32 <= self.image_size <= 2048, f"image_size {self.image_size} outside [32, 2048]")
-        _require(1 <= self.batch <= 1024, f"batch {self.batch} outside [1, 1024]")
+        require(self.key_env.isidentifier(), "key_env is the name of an environment variable; a key itself is never an option")
+        require(self.kind != "replay" or self.cache is not None, "backend kind 'replay' needs a cache, got null")
+        require(0.0 < self.timeout_s <= _LONGEST_S, f"timeout_s {self.timeout_s} outside (0, {_LONGEST_S:g}]")
+        require(0 <= self.retries <= 20, f"retries {self.retries} outside [0, 20]")
+        require(1 <= self.concurrency <= 1024, f"concurrency {self.concurrency} outside [1, 1024]")
+        require(self.max_tokens > 0, f"max_tokens {self.max_tokens} must be positive")
+        require(0.0 <= self.temperature <= 2.0, f"temperature {self.temperature} outside [0, 2]")
+        require(32 <= self.image_size <= 2048, f"image_size {self.image_size} outside [32, 2048]")
+        require(1 <= self.batch <= 1024, f"batch {self.batch} outside [1, 1024]")

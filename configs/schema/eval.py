@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from configs.schema.backend import BackendConfig
+from configs.schema.checks import defaults_of, require, require_used
 from configs.schema.robot import RobotConfig
 
 __all__ = [
@@ -44,11 +45,6 @@ _OF_KINDS: Final[Mapping[str, tuple[PlannerKind, ...]]] = {
     "image_size": ("random", "scripted", "expert"),
 }
 ExperimentName = Literal["main_table", "ablation_table", "replanning_table", "failure_figure", "distribution_figures"]
-
-
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise ValueError(message)
 
 
 @dataclass(frozen=True)
@@ -100,23 +96,18 @@ class PlannerConfig:
     parallel: bool = True
 
     def __post_init__(self) -> None:
-        _require(self.name.isidentifier(), f"planner name {self.name!r} must be an identifier")
-        _require((self.weights is not None) == (self.kind == "mllm"), f"kind {self.kind!r} with weights {self.weights!r}")
-        _require((self.source is not None) == (self.kind == "file"), f"kind {self.kind!r} with source {self.source!r}")
-        _require(self.temperature >= 0.0, f"temperature {self.temperature} must not be negative")
-        _require(self.max_new_tokens > 0, f"max_new_tokens {self.max_new_tokens} must be positive")
-        _require(16 <= self.image_size <= 2048, f"image_size {self.image_size} outside [16, 2048]")
+        require(self.name.isidentifier(), f"planner name {self.name!r} must be an identifier")
+        require((self.weights is not None) == (self.kind == "mllm"), f"kind {self.kind!r} with weights {self.weights!r}")
+        require((self.source is not None) == (self.kind == "file"), f"kind {self.kind!r} with source {self.source!r}")
+        require(self.temperature >= 0.0, f"temperature {self.temperature} must not be negative")
+        require(self.max_new_tokens > 0, f"max_new_tokens {self.max_new_tokens} must be positive")
+        require(16 <= self.image_size <= 2048, f"image_size {self.image_size} outside [16, 2048]")
         for name, low in (("replans", 0), ("horizon", 1), ("history", 1), ("examples", 0)):
-            _require(getattr(self, name) >= low, f"{name} {getattr(self, name)} must be at least {low}")
+            require(getattr(self, name) >= low, f"{name} {getattr(self, name)} must be at least {low}")
         needs = self.kind in ("llm_planner", "rap")
-        _require((self.memory is not None) == needs, f"kind {self.kind!r} with memory {self.memory!r}")
-        _require((self.examples > 0) == needs, f"kind {self.kind!r} with examples {self.examples}")
-        for name, kinds in _OF_KINDS.items():
-            default = self.__dataclass_fields__[name].default
-            _require(
-                self.kind in kinds or getattr(self, name) == default,
-                f"kind {self.kind!r} with {name} {getattr(self, name)!r}; allowed: {default!r}, others with {', '.join(kinds)}",
-            )
+        require((self.memory is not None) == needs, f"kind {self.kind!r} with memory {self.memory!r}")
+        require((self.examples > 0) == needs, f"kind {self.kind!r} with examples {self.examples}")
+        require_used(self, _OF_KINDS)
 
 
 @dataclass(frozen=True)
@@ -137,7 +128,7 @@ class ExperimentConfig:
 
     def __post_init__(self) -> None:
         for name in ("planners", "robots", "difficulties"):
-            _require(bool(getattr(self, name)), f"{name} () must name at least one")
+            require(bool(getattr(self, name)), f"{name} () must name at least one")
 
 
 @dataclass(frozen=True)
@@ -196,53 +187,53 @@ class EvalConfig:
     cost_cap_usd: float | None = None
 
     def __post_init__(self) -> None:
-        _require(self.trials > 0, f"trials {self.trials} must be positive")
-        _require(0 <= self.workers <= 4096, f"workers {self.workers} outside [0, 4096]")
-        _require(1 <= self.batch <= 1024, f"batch {self.batch} outside [1, 1024]")
-        _require(self.scheduler == "local" or self.workers > 0, f"workers {self.workers} must be positive with scheduler=ray")
-        _require(
+        require(self.trials > 0, f"trials {self.trials} must be positive")
+        require(0 <= self.workers <= 4096, f"workers {self.workers} outside [0, 4096]")
+        require(1 <= self.batch <= 1024, f"batch {self.batch} outside [1, 1024]")
+        require(self.scheduler == "local" or self.workers > 0, f"workers {self.workers} must be positive with scheduler=ray")
+        require(
             self.scheduler == "ray" or self.ray_address is None,
             f"ray_address {self.ray_address!r} needs scheduler=ray, got {self.scheduler!r}",
         )
-        _require(
+        require(
             self.batch == 1 or self.planner.kind == "mllm" or (self.planner.kind == "file" and self.backend is None),
             f"batch {self.batch} with planner kind {self.planner.kind!r}; allowed: mllm, or file with begin and step_batch; a "
             "backend has backend.batch",
         )
         chats = self.planner.kind in CHAT_KINDS
         asks = chats or (self.planner.kind == "file" and self.backend is not None)
-        _require(
+        require(
             (self.reflection == "on" and self.planner.reflection == "on") or asks or self.planner.kind == "mllm",
             f"reflection 'off' with planner kind {self.planner.kind!r}, which has none; allowed: on",
         )
-        _require(self.backend is not None or not chats, f"planner {self.planner.name!r} needs a backend; allowed: backend=NAME")
-        _require(
+        require(self.backend is not None or not chats, f"planner {self.planner.name!r} needs a backend; allowed: backend=NAME")
+        require(
             self.backend is None or asks,
             f"backend {self.backend.name if self.backend else ''!r} with planner kind {self.planner.kind!r}, which asks none; "
             f"allowed: none, or a planner of kind {', '.join(CHAT_KINDS)}, file",
         )
         for name in ("replans", "history", "body", "horizon") if self.planner.kind == "file" and not asks else ():
-            value, default = getattr(self.planner, name), PlannerConfig.__dataclass_fields__[name].default
-            _require(
+            value, default = getattr(self.planner, name), defaults_of(PlannerConfig)[name]
+            require(
                 value == default, f"planner.{name} {value!r} with planner kind 'file' without a backend; allowed: {default!r}"
             )
-        _require(1 <= self.threads <= 256, f"threads {self.threads} outside [1, 256]")
-        _require(
+        require(1 <= self.threads <= 256, f"threads {self.threads} outside [1, 256]")
+        require(
             self.threads == 1 or (asks and self.workers == 0),
             f"threads {self.threads} with planner kind {self.planner.kind!r} and workers {self.workers}; "
             f"allowed: planners that ask a backend, with workers=0",
         )
         local = self.backend is not None and self.backend.kind == "local"
-        _require(
+        require(
             self.workers == 0 or not local,
             f"workers {self.workers} with a model in this process; allowed: workers=0, with threads=N for N episodes at once",
         )
         cap = self.cost_cap_usd
-        _require(cap is None or 0.0 <= cap < math.inf, f"cost_cap_usd {cap} must be null or a finite number of at least 0")
-        _require(
+        require(cap is None or 0.0 <= cap < math.inf, f"cost_cap_usd {cap} must be null or a finite number of at least 0")
+        require(
             cap is None or asks,
             f"cost_cap_usd {cap} with planner kind {self.planner.kind!r}, which asks no backend; allowed: null",
         )
-        _require(self.limit is None or self.limit > 0, f"limit {self.limit} must be positive or null")
-        _require(self.retries >= 0, f"retries {self.retries} must not be negative")
-        _require(self.seed >= 0, f"seed {self.seed} must not be negative")
+        require(self.limit is None or self.limit > 0, f"limit {self.limit} must be positive or null")
+        require(self.retries >= 0, f"retries {self.retries} must not be negative")
+        require(self.seed >= 0, f"seed {self.seed} must not be negative")

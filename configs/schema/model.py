@@ -10,6 +10,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from configs.schema.checks import require
+
 __all__ = [
     "CseConfig",
     "LoraConfig",
@@ -25,11 +27,6 @@ MpeMode = Literal["mrope", "rope_sign", "rope_sign_raw", "rope_radial", "embed_s
 #: Frames of proprioception in shards and observations.
 LONGEST_WINDOW = 64
 CentroidName = Literal["body", "arms", "reach"]
-
-
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise ValueError(message)
 
 
 @dataclass(frozen=True)
@@ -98,8 +95,8 @@ class LoraConfig:
     dropout: float = 0.0
 
     def __post_init__(self) -> None:
-        _require(self.rank > 0, f"rank {self.rank} must be positive")
-        _require(0.0 <= self.dropout < 1.0, f"dropout {self.dropout} outside [0, 1)")
+        require(self.rank > 0, f"rank {self.rank} must be positive")
+        require(0.0 <= self.dropout < 1.0, f"dropout {self.dropout} outside [0, 1)")
 
 
 @dataclass(frozen=True)
@@ -146,16 +143,16 @@ class MotionTokenizerConfig:
 
     def __post_init__(self) -> None:
         for name in ("features", "window", "codes", "stages", "code_dim", "width", "depth", "dilation", "down"):
-            _require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
-        _require(self.window <= LONGEST_WINDOW, f"window {self.window} must be at most {LONGEST_WINDOW}, what shards hold")
-        _require(self.window % self.stride == 0, f"window {self.window} must be a multiple of {self.stride}")
+            require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
+        require(self.window <= LONGEST_WINDOW, f"window {self.window} must be at most {LONGEST_WINDOW}, what shards hold")
+        require(self.window % self.stride == 0, f"window {self.window} must be a multiple of {self.stride}")
 
         grid = math.prod(self.levels)
-        _require(
+        require(
             self.quantizer != "fsq" or grid == self.codes, f"levels {self.levels} make {grid} codes, not codes {self.codes}"
         )
-        _require(min(self.levels, default=0) > 2, f"levels {self.levels} must each be at least 3")
-        _require(
+        require(min(self.levels, default=0) > 2, f"levels {self.levels} must each be at least 3")
+        require(
             self.quantizer == "vq" or self.update == "ema", f"update {self.update!r} is for quantizer vq, not {self.quantizer}"
         )
 
@@ -193,9 +190,9 @@ class TinyTextConfig:
     rope_theta: float = 10000.0
 
     def __post_init__(self) -> None:
-        _require(self.hidden % self.heads == 0, f"hidden {self.hidden} must be a multiple of heads {self.heads}")
-        _require(self.heads % self.kv_heads == 0, f"heads {self.heads} must be a multiple of kv_heads {self.kv_heads}")
-        _require((self.hidden // self.heads) % 16 == 0, f"head size {self.hidden // self.heads} must be a multiple of 16")
+        require(self.hidden % self.heads == 0, f"hidden {self.hidden} must be a multiple of heads {self.heads}")
+        require(self.heads % self.kv_heads == 0, f"heads {self.heads} must be a multiple of kv_heads {self.kv_heads}")
+        require((self.hidden // self.heads) % 16 == 0, f"head size {self.hidden // self.heads} must be a multiple of 16")
 
 
 @dataclass(frozen=True)
@@ -208,7 +205,7 @@ class TinyVisionConfig:
     intermediate: int = 512
 
     def __post_init__(self) -> None:
-        _require(self.hidden % self.heads == 0, f"hidden {self.hidden} must be a multiple of heads {self.heads}")
+        require(self.hidden % self.heads == 0, f"hidden {self.hidden} must be a multiple of heads {self.heads}")
 
 
 @dataclass(frozen=True)
@@ -243,12 +240,12 @@ class ModelConfig:
     motion: MotionTokenizerConfig = field(default_factory=MotionTokenizerConfig)
 
     def __post_init__(self) -> None:
-        _require(self.image_size > 0 and self.image_size % 28 == 0, f"image_size {self.image_size} must be a multiple of 28")
-        _require(
+        require(self.image_size > 0 and self.image_size % 28 == 0, f"image_size {self.image_size} must be a multiple of 28")
+        require(
             not (self.cse.enabled and self.point_map.encoder == "none"),
             "cse.enabled needs a point map: point_map.encoder 'none' is not allowed; allowed: sim, cut3r, oracle",
         )
-        _require(
+        require(
             not (self.cse.enabled and self.point_map.encoder == "oracle" and self.cse.source != "points"),
             f"point_map.encoder 'oracle' has points only: cse.source {self.cse.source!r} is not allowed; allowed: points",
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from configs.schema.checks import require
 from configs.schema.data import DataConfig
 from configs.schema.model import ModelConfig
 
@@ -27,14 +28,9 @@ StageName = Literal["all", "data", "collect", "base", "corrections", "pointmap",
 Variant = Literal["full", "no_mpe", "no_cse", "no_mpe_cse", "no_proprio"]
 
 
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise ValueError(message)
-
-
 def _require_shares(cfg: object, *names: str) -> None:
     for name in names:
-        _require(0.0 <= getattr(cfg, name) <= 1.0, f"{name} {getattr(cfg, name)} outside [0, 1]")
+        require(0.0 <= getattr(cfg, name) <= 1.0, f"{name} {getattr(cfg, name)} outside [0, 1]")
 
 
 @dataclass(frozen=True)
@@ -70,9 +66,9 @@ class LoopConfig:
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "checkpoint_every", "log_every"):
-            _require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
-        _require(self.lr > 0.0, f"lr {self.lr} must be positive")
-        _require(self.minutes >= 0.0, f"minutes {self.minutes} must not be negative")
+            require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
+        require(self.lr > 0.0, f"lr {self.lr} must be positive")
+        require(self.minutes >= 0.0, f"minutes {self.minutes} must not be negative")
 
 
 @dataclass(frozen=True)
@@ -99,7 +95,7 @@ class BaseConfig:
 
     def __post_init__(self) -> None:
         _require_shares(self, "plan_share", "exercise_share", "judge_share")
-        _require(self.questions > 0, f"questions {self.questions} must be positive")
+        require(self.questions > 0, f"questions {self.questions} must be positive")
 
 
 @dataclass(frozen=True)
@@ -128,7 +124,7 @@ class AlignmentConfig:
 
     def __post_init__(self) -> None:
         _require_shares(self, "plan_share", "exercise_share", "judge_share", "mask")
-        _require(self.questions > 0, f"questions {self.questions} must be positive")
+        require(self.questions > 0, f"questions {self.questions} must be positive")
 
 
 @dataclass(frozen=True)
@@ -159,8 +155,8 @@ class SeluConfig:
     def __post_init__(self) -> None:
         _require_shares(self, "replay_share")
         for name in ("rounds", "episodes", "per_class"):
-            _require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
-        _require(self.temperature > 0.0, f"temperature {self.temperature} must be positive: exploration needs draws")
+            require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
+        require(self.temperature > 0.0, f"temperature {self.temperature} must be positive: exploration needs draws")
 
 
 @dataclass(frozen=True)
@@ -198,8 +194,8 @@ class CorrectionsConfig:
 
     def __post_init__(self) -> None:
         for name in ("episodes", "exercises"):
-            _require(getattr(self, name) >= 0, f"{name} {getattr(self, name)} must not be negative")
-        _require(self.workers > 0, f"workers {self.workers} must be positive")
+            require(getattr(self, name) >= 0, f"{name} {getattr(self, name)} must not be negative")
+        require(self.workers > 0, f"workers {self.workers} must be positive")
         _require_shares(self, "expert_share")
 
 
@@ -256,4 +252,4 @@ class TrainConfig:
     resume: bool = True
 
     def __post_init__(self) -> None:
-        _require(0 <= self.seed <= LARGEST_SEED, f"seed {self.seed} outside [0, {LARGEST_SEED}]")
+        require(0 <= self.seed <= LARGEST_SEED, f"seed {self.seed} outside [0, {LARGEST_SEED}]")

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Final
 
 from configs.schema.backend import BackendConfig
+from configs.schema.checks import defaults_of
 from data.code_files import source_digest
 
 __all__ = ["identity_in_words", "identity_of"]
-
-#: What needs no words.
-_USUAL: Final = {"revision": "", "structured": "json_schema", "dtype": "auto", "constrained": False}
 
 
 def identity_of(cfg: BackendConfig) -> str:
@@ -49,7 +46,8 @@ def identity_in_words(identity: str) -> str:
         return identity
     if "script" in values:
         return f"a script of digest {values['script']}"
-    told = (f"backend.{name}={_option(value)}" for name, value in values.items() if _USUAL.get(name, ...) != value)
+    usual = defaults_of(BackendConfig)
+    told = (f"backend.{name}={_option(value)}" for name, value in values.items() if usual.get(name, ...) != value)
     return " ".join(sorted(told, key=lambda one: not one.startswith("backend.model")))
 
 

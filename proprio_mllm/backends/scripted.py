@@ -19,12 +19,6 @@ from proprio_mllm.backends.protocol import BackendError, BackendSetupError, Chat
 __all__ = ["ScriptedChat"]
 
 
-def _line(error: Exception) -> str:
-    """Where an error came up."""
-    frames = traceback.extract_tb(error.__traceback__)
-    return f" at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
-
-
 class ScriptedChat:
     """Calls the function.
 
@@ -68,3 +62,9 @@ class ScriptedChat:
 
     def close(self) -> None:
         """Holds nothing."""
+
+
+def _line(error: Exception) -> str:
+    """Where an error came up."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return f" at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""

@@ -5,22 +5,19 @@ Paper: none (engineering).
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Mapping
-from dataclasses import fields
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
-
-from configs.compose import CONFIG_DIR
+from configs.compose import group_file
 from configs.schema.backend import BackendConfig
+from configs.schema.checks import defaults_of
 from configs.schema.eval import PlannerConfig
 
 __all__ = ["as_published", "options_of"]
 
 #: Of a planner's fields, those that say who plans rather than how, and `reflection`, which tables have columns for.
-_WHO: Final = frozenset({"name", "kind", "label", "weights", "source", "adapter", "train", "memory", "reflection"})
+_WHO: Final = frozenset({"weights", "source", "adapter", "train", "memory", "reflection"})
 _ASKED: Final = ("temperature", "max_tokens", "image_size")
 
 
@@ -44,10 +41,8 @@ def options_of(config: Mapping[str, Any]) -> list[str]:
         ("no_reflection", planner.get("reflection", "on") == "off"),
         ("body", planner.get("body", False)),
         ("one_node", not planner.get("parallel", True)),
-        *_changed(
-            planner, _published(str(planner.get("name", ""))), ("horizon", "replans", "history", "examples", "temperature")
-        ),
-        *_changed(config.get("backend") or {}, _defaults(BackendConfig), _ASKED),
+        *_changed(planner, _published(planner), ("horizon", "replans", "history", "examples", "temperature")),
+        *_changed(config.get("backend") or {}, defaults_of(BackendConfig), _ASKED),
         (f"seed{seed}", seed != 0),
         (Path(tasks).stem, tasks != "benchmark"),
     )
@@ -63,34 +58,21 @@ def as_published(config: Mapping[str, Any]) -> bool:
         config: as of `options_of`.
     """
     planner, backend = config.get("planner", {}), config.get("backend") or {}
-    name = str(planner.get("name", ""))
-    own = planner if _file(name) is None else {}
-    changes = [
-        *_changed(planner, _published(name) | own, [field for field in _defaults(PlannerConfig) if field not in _WHO]),
-        *_changed(backend, _defaults(BackendConfig), _ASKED),
-    ]
+    changes = _changed(backend, defaults_of(BackendConfig), _ASKED)
+    if group_file("planner", _name(planner)):
+        changes += _changed(planner, _published(planner), [name for name in defaults_of(PlannerConfig) if name not in _WHO])
     return not any(otherwise for _, otherwise in changes)
 
 
-def _changed(values: Mapping[str, Any], usual: Mapping[str, Any], names: list[str] | tuple[str, ...]) -> list[tuple[str, bool]]:
+def _changed(values: Mapping[str, Any], usual: Mapping[str, Any], names: Sequence[str]) -> list[tuple[str, bool]]:
     """Each setting in words, and whether it is another than usual."""
     return [(f"{name}{values.get(name)}", values.get(name, usual[name]) != usual[name]) for name in names]
 
 
-@functools.cache
-def _published(planner: str) -> dict[str, Any]:
+def _published(planner: Mapping[str, Any]) -> dict[str, Any]:
     """Settings of a planner's file in `configs/planner`; of one that has none, the defaults."""
-    path = _file(planner)
-    own = {} if path is None else yaml.safe_load(path.read_text(encoding="utf-8"))
-    usual = _defaults(PlannerConfig)
-    return usual | {name: value for name, value in own.items() if name in usual}
+    return defaults_of(PlannerConfig) | group_file("planner", _name(planner))
 
 
-def _file(planner: str) -> Path | None:
-    path = CONFIG_DIR / "planner" / f"{planner}.yaml"
-    return path if planner.isidentifier() and path.is_file() else None
-
-
-@functools.cache
-def _defaults(schema: type) -> dict[str, Any]:
-    return {field.name: field.default for field in fields(schema)}
+def _name(planner: Mapping[str, Any]) -> str:
+    return str(planner.get("name", ""))

@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 import configs
 from configs.schema.backend import BackendConfig
+from configs.schema.checks import defaults_of
 from configs.schema.eval import CHAT_KINDS, EvalConfig, PlannerConfig
 from data.cluster import import_ray
 from data.code_files import source_digest, split_source
@@ -122,7 +123,7 @@ def config_hash(cfg: EvalConfig, digest: str) -> str:
     for name in ("label", "train", "weights", "source", "memory"):
         del planner[name]
     # what a planner's kind does not know, or leaves as it has always been, is no part of its runs' names
-    defaults = {f.name: f.default for f in dataclasses.fields(PlannerConfig)}
+    defaults = defaults_of(PlannerConfig)
     for name in ("reflection", "replans", "horizon", "history", "body", "examples", "parallel"):
         if cfg.planner.kind not in CHAT_KINDS and planner[name] == defaults[name]:
             del planner[name]

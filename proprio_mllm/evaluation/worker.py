@@ -29,6 +29,7 @@ from proprio_mllm.evaluation.episode import (
     episode_steps,
     run_episode,
 )
+from proprio_mllm.planners.bars import without_bar
 from proprio_mllm.planners.protocol import BatchPlanner, Planner, PlannerReply
 from proprio_mllm.planners.registry import make_chat_planner, make_planner
 from sim.tasks.task import Task
@@ -36,10 +37,10 @@ from sim.tasks.task import Task
 if TYPE_CHECKING:
     from proprio_mllm.evaluation.recording import RolloutRecorder
 
+__all__ = ["EpisodeJob", "EpisodeResult", "EpisodeWorker", "Opener", "PlannerServer", "WorkerSetup", "lost_episode"]
+
 #: Calls in a row that do not reach a server which has answered before, each with its repetitions, until the run stops.
 _MOST_UNREACHED: Final = 5
-
-__all__ = ["EpisodeJob", "EpisodeResult", "EpisodeWorker", "Opener", "PlannerServer", "WorkerSetup", "lost_episode"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,13 +342,13 @@ def _planner(setup: WorkerSetup) -> Planner:
         from proprio_mllm.evaluation.privileged import ExpertPlanner
 
         return ExpertPlanner(setup.planner.image_size)
-    if setup.planner.kind == "mllm":
-        import torch
-        from transformers.utils import logging as transformers_logging
+    if setup.planner.kind != "mllm":
+        return make_planner(setup.planner)
+    import torch
 
-        torch.set_num_threads(1)
-        transformers_logging.disable_progress_bar()  # bars of several processes would run across the run's own
-    return make_planner(setup.planner)
+    torch.set_num_threads(1)
+    with without_bar():
+        return make_planner(setup.planner)
 
 
 def _result(

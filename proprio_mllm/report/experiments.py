@@ -10,9 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
-
-from configs.compose import CONFIG_DIR, groups
+from configs.compose import group_file, groups
 from configs.schema.eval import CHAT_KINDS, ExperimentConfig
 from data.files import write_text
 from proprio_mllm.report.figures import distribution_figures, failure_figure
@@ -35,8 +33,7 @@ _COSTS: Final = ("invalid %", "broken", "calls", "tokens", "USD", "model")
 
 def _planner(name: str) -> Mapping[str, Any]:
     """A planner's configuration file; empty for one that has none."""
-    path = CONFIG_DIR / "planner" / f"{name}.yaml"
-    return yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return group_file("planner", name)
 
 
 def _label(name: str) -> str:
@@ -65,8 +62,7 @@ def _own_model(planner: str) -> str:
     backend = next((value for entry in named for key, value in entry.items() if "/backend" in key), None)
     if backend is None:
         return ""
-    values = yaml.safe_load((CONFIG_DIR / "backend" / f"{backend}.yaml").read_text(encoding="utf-8"))
-    model = str(values.get("model", ""))
+    model = str(group_file("backend", backend).get("model", ""))
     return "" if model == "???" else model
 
 

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from configs.help import asks_for_help
+from configs.help import shows_help
 from data.shards import ShardError
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.reconstruction import chosen_pairs, draw_reconstruction
@@ -22,8 +22,7 @@ __all__ = ["main"]
 
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 1 when an input is missing, 2 on wrong arguments."""
-    if asks_for_help(arguments):
-        sys.stdout.write(f"{(__doc__ or '').strip()}\n")
+    if shows_help(arguments, __doc__):
         return 0
     if len(arguments) not in (2, 3):
         sys.stderr.write("usage: python -m proprio_mllm.report.reconstruction TOKENIZER CLIPS [FILE.png]\n")

@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from configs.help import asks_for_help
+from configs.help import shows_help
 from proprio_mllm.report.reenact import Reenactment, RunTasks, find_record
 from proprio_mllm.report.runs import Run, load_run
 
@@ -92,8 +92,7 @@ def draw_strip(frames: Sequence[Frame], title: str, path: Path, per_row: int = 8
 
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 2 on wrong arguments."""
-    if asks_for_help(arguments):
-        sys.stdout.write(f"{(__doc__ or '').strip()}\n")
+    if shows_help(arguments, __doc__):
         return 0
     options = dict(part.split("=", 1) for part in arguments[2:] if "=" in part)
     if len(arguments) < 2 or len(options) != len(arguments) - 2 or set(options) - {"trial", "out", "camera"}:

@@ -263,16 +263,18 @@ def test_a_silent_server(cfg: BackendConfig, server: LoopbackServer) -> None:
     assert time.perf_counter() - start < 2.0
 
 
-def test_a_server_that_drips(cfg: BackendConfig, server: LoopbackServer) -> None:
-    def drip(handler: Handler) -> None:
-        handler.send_response(200)
-        handler.send_header("Content-Type", "application/json")
-        handler.send_header("Content-Length", "1000")
-        handler.end_headers()
-        for _ in range(100):
-            handler.wfile.write(b" ")
-            time.sleep(0.05)
+def drip(handler: Handler) -> None:
+    """A body that comes a blank at a time."""
+    handler.send_response(200)
+    handler.send_header("Content-Type", "application/json")
+    handler.send_header("Content-Length", "1000")
+    handler.end_headers()
+    for _ in range(100):
+        handler.wfile.write(b" ")
+        time.sleep(0.05)
 
+
+def test_a_server_that_drips(cfg: BackendConfig, server: LoopbackServer) -> None:
     server.answer = drip
     start = time.perf_counter()
     error = error_of(cfg, timeout_s=0.4)
@@ -334,15 +336,6 @@ def test_a_list_of_models_that_drips_is_not_waited_for(
     cfg: BackendConfig, server: LoopbackServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("proprio_mllm.backends.openai_chat._LIST_TIMEOUT_S", 0.3)
-
-    def drip(handler: Handler) -> None:
-        handler.send_response(200)
-        handler.send_header("Content-Type", "application/json")
-        handler.send_header("Content-Length", "1000")
-        handler.end_headers()
-        for _ in range(100):
-            handler.wfile.write(b" ")
-            time.sleep(0.05)
 
     server.answer = drip
     backend = OpenAIChat(cfg)

