@@ -29,7 +29,7 @@ def make_data(cfg: TrainConfig) -> None:
     """Motions: generate or load, retarget to both robots, filter, replay with head-camera frames, write `clips` shards."""
     from data.pipeline import build_clips
     from proprio_mllm.training.paths import StagePaths
-    from sim.replay import replay_clip
+    from sim.collection.replay import replay_clip
 
     size = dataclasses.replace(cfg.data.replay, image_size=cfg.model.image_size)
     motions = dataclasses.replace(cfg.data, seed=cfg.seed, replay=size)
@@ -42,7 +42,7 @@ def make_shards(cfg: TrainConfig) -> None:
     """Posed views, exercises in words, and the expert's demonstrations on training tasks."""
     from configs.schema.collect import CollectConfig as ShardConfig
     from proprio_mllm.training.paths import StagePaths
-    from sim.collect import collect
+    from sim.collection.collect import collect
 
     wanted: tuple[tuple[Literal["views", "exercises", "judgements", "demos"], int, int], ...]
     wanted = (
@@ -111,7 +111,7 @@ def _rollouts(*args: Any, **kwargs: Any) -> Any:
 
 def _corrections(*args: Any, **kwargs: Any) -> Any:
     """The base model acts in the simulator and the expert corrects it; training reads the shards."""
-    from proprio_mllm.evaluation.corrections import collect_corrections
+    from proprio_mllm.evaluation.dagger import collect_corrections
 
     return collect_corrections(*args, **kwargs)
 

@@ -18,10 +18,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from data.records import Action, ActionOutcome, Arm, PlanStep
-from sim.catalogue import MovingSpec
-from sim.failures import SkillFailure
-from sim.rooms import room_names
-from sim.session import FreePlay, Session
+from sim.scene.catalogue import MovingSpec
+from sim.scene.rooms import room_names
+from sim.session.session import FreePlay, Session
+from sim.skills.failures import SkillFailure
 
 #: What follows the object in GoTo, in turn: distances and bearings.
 PLACES = ("", ", 0.45", ", 0.55", ", auto, -20", ", auto, 20", ", 0.4", ", 0.5, -30", ", 0.5, 30", ", 0.6")

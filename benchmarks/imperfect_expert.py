@@ -22,7 +22,7 @@ from dataclasses import replace
 
 from data.records import Action, ActionKind, PlanStep
 from proprio_mllm.backends.protocol import ChatReply, ChatRequest
-from sim.tasks.certificates import load_certificates
+from sim.benchmark.certificates import load_certificates
 from sim.tasks.task import load_benchmark
 
 MISTAKES = float(os.environ.get("MISTAKES", "0.2"))

@@ -31,8 +31,8 @@ from configs.validate import build
 from data.records import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.planners.memory import MemoryFileError, check_memory
+from sim.benchmark.certificates import load_certificates
 from sim.robots.spec import available_robots
-from sim.tasks.certificates import load_certificates
 from sim.tasks.task import Task, load_benchmark, write_tasks
 
 SCRIPT = Path(__file__).with_name("imperfect_expert.py")

@@ -23,7 +23,7 @@ from data.generator import write_dataset
 from data.humanml3d import list_clips
 from data.pipeline import part_of_clips
 from data.shards import ShardWriter
-from sim.replay import replay_clip
+from sim.collection.replay import replay_clip
 
 PAPER_CLIPS = 11_955
 CORES = (2, 64, 1024)

@@ -16,8 +16,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sim.robots.spec import SIDES, RobotSpec, available_robots, load_robot
-from sim.scene import BASE_JOINTS, TIMESTEP_S
-from sim.world import World
+from sim.scene.compiler import BASE_JOINTS, TIMESTEP_S
+from sim.world.world import World
 
 STEP_RAD = 0.2
 SLIDE_M = 0.02

@@ -1,7 +1,7 @@
 """From human motion to `clips` shards: load, filter, retarget, filter again, replay, write.
 
-Pictures need the simulator, which `data` may not import: the caller hands in a function (`sim.replay.replay_clip`). Parts are
-computed by worker processes and written by this one; an interrupted run continues.
+Pictures need the simulator, which `data` may not import: the caller hands in a function (`sim.collection.replay.replay_clip`).
+Parts are computed by worker processes and written by this one; an interrupted run continues.
 
 Paper: data preparation for stages 1 and 2 (HumanML3D, PHC filtering, retargeting, replay in the simulator).
 """
@@ -176,7 +176,7 @@ def build_clips(
     Args:
         cfg: configuration.
         out: shard folder.
-        replay: makes pictures (`sim.replay.replay_clip`); None writes clips without.
+        replay: makes pictures (`sim.collection.replay.replay_clip`); None writes clips without.
         progress: called with parts done and parts in all.
         overwrite: start over when the folder holds shards of another configuration.
 

@@ -295,7 +295,7 @@ class ActionOutcome:
     Attributes:
         action: the action as it was asked for.
         success: whether its effect was reached in the physics.
-        code: failure code of `sim.failures` (for example `TooFar`), `""` on success.
+        code: failure code of `sim.skills.failures` (for example `TooFar`), `""` on success.
         category: the paper's failure type the code rolls up to, None on success.
         margins: signed quantities that explain the failure (`reach_m`, `height_m`, `mass_kg` …), for traces and analysis.
         message: one readable sentence without numbers about hidden positions.

@@ -12,8 +12,8 @@ trace:
 3. The type that most of them have decides, in a tie the type of the last one.
 4. Without any standing failure the plan itself was wrong or stopped too early: logical.
 
-A failure's own type comes with its code (`sim.failures`): out of reach at every pelvis height is navigation, out of reach at
-this pelvis height is body adjustment, the rest is logical, invalid replies included.
+A failure's own type comes with its code (`sim.skills.failures`): out of reach at every pelvis height is navigation, out of
+reach at this pelvis height is body adjustment, the rest is logical, invalid replies included.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ import numpy as np
 
 from data.records import Feedback, Observation
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
-from sim.expert import Expert
-from sim.session import Session
+from sim.expert.expert import Expert
+from sim.session.session import Session
 
 __all__ = ["ExpertPlanner", "PrivilegedPlanner"]
 

@@ -30,8 +30,8 @@ from data.cluster import import_ray
 from data.code_files import source_digest, split_source
 from data.files import file_hash, write_text
 from data.records import EpisodeRecord, Outcome
+from proprio_mllm.backends.factory import check_cap, make_backend, told_revision
 from proprio_mllm.backends.identity import identity_of
-from proprio_mllm.backends.making import check_cap, make_backend, told_revision
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest
 from proprio_mllm.evaluation.batching import batch_planner
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
@@ -43,8 +43,8 @@ from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, Opener, Wo
 from proprio_mllm.planners.memory import MEMORY_FILE, check_memory
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.planners.registry import make_chat_planner, make_planner
-from sim.contingency import load_contingency
 from sim.robots.spec import load_robot
+from sim.session.contingency import load_contingency
 from sim.tasks.task import Task, load_benchmark, read_tasks
 
 __all__ = ["RUN_VERSION", "EvalRun", "evaluate", "plan_episodes", "run_folder", "select_tasks", "task_key", "weights_digest"]

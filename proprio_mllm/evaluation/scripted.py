@@ -19,7 +19,7 @@ import numpy as np
 from configs.schema.robot import RobotConfig
 from data.records import ACTIONS, ActionKind, EpisodeRecord, FailureCategory, Outcome, PlanStep
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, RunnableSession, run_episode
-from proprio_mllm.evaluation.faults import CAUSES, LATE_SLIPS, SLIPS, Cause, FaultyPlanner
+from proprio_mllm.evaluation.fault_injection import CAUSES, LATE_SLIPS, SLIPS, Cause, FaultyPlanner
 from proprio_mllm.evaluation.seeds import episode_seed, stream
 from proprio_mllm.evaluation.sessions import open_session
 from sim.tasks.task import BENCHMARK_PATH, Task, load_benchmark

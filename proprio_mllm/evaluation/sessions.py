@@ -12,7 +12,7 @@ from proprio_mllm.evaluation.attribution import unmet_objects
 from proprio_mllm.evaluation.episode import GoalReport, RunnableSession, Stats
 from proprio_mllm.evaluation.starts import started
 from proprio_mllm.planners.protocol import Planner
-from sim.session import Session
+from sim.session.session import Session
 from sim.tasks.task import Task
 
 __all__ = ["SimSession", "open_session"]

@@ -18,7 +18,7 @@ from proprio_mllm.evaluation.seeds import stream
 from sim.robots.spec import RobotSpec, load_robot
 from sim.skills.obstacles import navigation_map
 from sim.tasks.task import Start, Task
-from sim.world import World, WorldError
+from sim.world.world import World, WorldError
 
 __all__ = ["random_start", "started"]
 

@@ -279,7 +279,7 @@ class _Chats:
     """Planners of one process that share a backend, and why it can answer no more."""
 
     def __init__(self, setup: WorkerSetup) -> None:
-        from proprio_mllm.backends.making import make_backend  # clients and models load only where they are asked
+        from proprio_mllm.backends.factory import make_backend  # clients and models load only where they are asked
 
         assert setup.backend is not None
         self._setup, self._cfg = setup, setup.backend

@@ -21,7 +21,7 @@ from proprio_mllm.evaluation.run import plan_episodes, select_tasks
 from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.starts import started
 from proprio_mllm.report.runs import Run
-from sim.session import Session
+from sim.session.session import Session
 from sim.tasks.task import Task
 
 __all__ = ["Episode", "Moment", "Reenactment", "RunTasks", "TaskGoneError", "find_record"]

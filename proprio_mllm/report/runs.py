@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from data.files import write_text
-from proprio_mllm.backends.making import SPENDING_FILE
+from proprio_mllm.backends.factory import SPENDING_FILE
 from proprio_mllm.backends.protocol import BackendError
 from proprio_mllm.backends.spending import Spending
 from proprio_mllm.evaluation.naming import as_published

@@ -17,7 +17,7 @@ from proprio_mllm.evaluation.attribution import INVALID_OUTPUT
 from proprio_mllm.report.arguments import read_named
 from proprio_mllm.report.reenact import Episode, Reenactment, RunTasks, find_record
 from proprio_mllm.report.runs import load_run
-from sim.video import VideoRecorder, check_film
+from sim.tools.video import VideoRecorder, check_film
 
 __all__ = ["VideoConfig", "film", "main"]
 

@@ -1,7 +1,7 @@
 """Goals, failure codes and margins in words, for people who read an episode.
 
-Margins are signed and named as `sim.failures` says; goals are printed from their plain form, so that a new kind of predicate
-needs nothing here.
+Margins are signed and named as `sim.skills.failures` says; goals are printed from their plain form, so that a new kind of
+predicate needs nothing here.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from sim.failures import FAILURES, FailureCode
+from sim.skills.failures import FAILURES, FailureCode
 
 __all__ = ["code_in_words", "goal_in_words", "margins_in_words"]
 

@@ -35,7 +35,7 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, described_motion, felt_body, filled_motion, looking, made_motion
 from proprio_mllm.training.asking import answer_shares
-from proprio_mllm.training.judging import judge_example
+from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.phrases import body_state_words
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, Exercises, Judgements, Views
 

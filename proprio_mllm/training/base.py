@@ -23,7 +23,7 @@ from proprio_mllm.model.dense import DenseHead, DenseTargets, dense_targets
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
 from proprio_mllm.training.asking import LONGEST_STEP, answer_shares, replies
-from proprio_mllm.training.judging import judge_example
+from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, Exercises, Views
 

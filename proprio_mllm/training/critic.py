@@ -20,8 +20,8 @@ from proprio_mllm.model.building import use_adapter
 from proprio_mllm.model.chat import Message
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import Style, answers, critic_prompt, plan_prompt, self_ask_prompt, with_answer
+from proprio_mllm.training.goal_questions import LOG_LENGTH
 from proprio_mllm.training.goals import Relabel, relabel, verbs_of
-from proprio_mllm.training.judging import LOG_LENGTH
 from proprio_mllm.training.rollouts import Rollout
 
 __all__ = [

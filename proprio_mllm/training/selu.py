@@ -38,8 +38,8 @@ from proprio_mllm.training.critic import (
     critic_examples,
     keep,
 )
+from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.goals import Relabel
-from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
 from proprio_mllm.training.sources import Bodies, Judgements

@@ -31,8 +31,8 @@ from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, answers, critic_prompt, named_prompt, plan_prompt, self_ask_prompt, with_answer
 from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
-from proprio_mllm.training.exercises import OBJECT_ID, Exchange, is_symbolic
 from proprio_mllm.training.states import asked_relation, history_of, open_hands, states_from_log
+from proprio_mllm.training.text_planning import OBJECT_ID, Exchange, is_symbolic
 
 __all__ = ["Bodies", "Clips", "Demos", "Exercises", "Judgements", "Views", "held_out", "shard_hash", "step_in_words"]
 
@@ -347,7 +347,7 @@ class Bodies:
 
 
 class Exercises:
-    """Planning exercises in text alone: those of the shards (`sim.paper_world` writes them), and logs with names exchanged.
+    """Text-planning rows of shards (`sim.collection.text_world` writes them), and logs with names exchanged.
 
     Args:
         folder: `exercises` shards.
@@ -411,7 +411,7 @@ class Exercises:
 
 
 class Judgements:
-    """Questions in text alone whether an instruction was carried out (`sim.paper_world`)."""
+    """Questions in text alone whether an instruction was carried out (`sim.collection.text_world`)."""
 
     def __init__(self, folder: Path, cfg: ModelConfig) -> None:
         self.reader = ShardReader(folder, "judgements")

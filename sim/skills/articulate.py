@@ -18,18 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Action, Arm
-from sim.failures import FailureCode, SkillFailure
-from sim.navigation import Stance
-from sim.objects import MovingPart, ObjectInstance
+from sim.scene.objects import MovingPart, ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
+from sim.skills.failures import FailureCode, SkillFailure
 from sim.skills.lids import closed_on, led_on, plan_lead, plan_tab
 from sim.skills.locomotion import sweep
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
+from sim.skills.navigation import Stance
+from sim.skills.plan_cache import remembered
 from sim.skills.push import Push, plan_push, push_shut
 from sim.skills.reach import Reach, explained, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
-from sim.skills.remembered import remembered
 from sim.skills.runner import Skill
 
 __all__ = ["assess_open_close", "assess_toggle", "open_close", "plan_handle", "plan_press", "toggle"]

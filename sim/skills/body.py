@@ -23,22 +23,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Action, Arm
-from sim.navigation import NavigationMap, Stance
-from sim.objects import ObjectInstance
-from sim.placement import OVERHANG_SHARE
 from sim.robots.arm_ik import PerArmSolver
 from sim.robots.build_solver import RobotKit, robot_kit
 from sim.robots.self_collision import SELF_TOUCH_M
 from sim.robots.solver import ReachTarget
-from sim.scene import BASE_JOINTS
+from sim.scene.compiler import BASE_JOINTS
+from sim.scene.objects import ObjectInstance
 from sim.skills.clearance import ClearanceProbe
 from sim.skills.footsteps import footsteps
 from sim.skills.gait import leg_motion
+from sim.skills.navigation import NavigationMap, Stance
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach_map import WOUND_RAD, HandPose, ReachMap, reach_maps
 from sim.skills.runner import CONTROL_DT_S, Skill
-from sim.trajectory import Trajectory, plan
-from sim.world import World
+from sim.skills.trajectory import Trajectory, plan
+from sim.world.placement import OVERHANG_SHARE
+from sim.world.world import World
 
 __all__ = ["ArmGoal", "Body", "BothGoal", "ready_posture", "wait"]
 
@@ -98,7 +98,7 @@ class BothGoal:
 
 @dataclass(slots=True)
 class Plans:
-    """Plans of actions from one state, see `sim.skills.remembered`."""
+    """Plans of actions from one state, see `sim.skills.plan_cache`."""
 
     state: object = None
     made: dict[Action, Any] = field(default_factory=dict)

@@ -7,10 +7,10 @@ the object allows, then weight, then access. Reach is found out later, by the sk
 from __future__ import annotations
 
 from data.records import Arm
-from sim.failures import FailureCode, SkillFailure
-from sim.liquids import capacity_l, spout
-from sim.objects import ObjectInstance
+from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body
+from sim.skills.failures import FailureCode, SkillFailure
+from sim.world.liquids import capacity_l, spout
 
 __all__ = [
     "check_clean",

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Arm
-from sim.objects import MovingPart, ObjectInstance
-from sim.world import World
+from sim.scene.objects import MovingPart, ObjectInstance
+from sim.world.world import World
 
 if TYPE_CHECKING:
     from sim.skills.body import Body

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.objects import MovingPart, ObjectInstance
+from sim.scene.objects import MovingPart, ObjectInstance
 from sim.skills.body import Body
 from sim.skills.clearance import AtDoor
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Arm
-from sim.objects import ObjectInstance
 from sim.robots.spec import HandSpec
+from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body
 from sim.skills.reach_map import HandPose
 

@@ -8,15 +8,15 @@ held falls, and a door with a spring shuts. Paper: holding and releasing of the 
 from __future__ import annotations
 
 from data.records import Action
-from sim.failures import FailureCode, SkillFailure
 from sim.skills.articulate import plan_handle
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_hold
+from sim.skills.failures import FailureCode, SkillFailure
 from sim.skills.grasps import Grasp
 from sim.skills.manipulate import GRASP_GAP_M, Luck, grip, plan_pick, retreat, stow
+from sim.skills.plan_cache import remembered
 from sim.skills.reach import Reach
 from sim.skills.reach_map import HandPose
-from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
 
 __all__ = ["assess_hold", "hold", "release"]

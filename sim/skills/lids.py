@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Arm
-from sim.navigation import Stance
 from sim.skills.body import Body
+from sim.skills.navigation import Stance
 from sim.skills.reach import Reach, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
 

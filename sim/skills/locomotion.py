@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Action, Arm
-from sim.failures import FailureCode, SkillFailure
-from sim.navigation import NavigationMap, Stance, wrap_angle
 from sim.skills.body import Body
+from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.navigation import NavigationMap, Stance, wrap_angle
 from sim.skills.runner import CONTROL_DT_S, Skill
-from sim.trajectory import min_jerk, plan, plan_polyline
+from sim.skills.trajectory import min_jerk, plan, plan_polyline
 
 __all__ = ["best_stance", "change_height", "go_to", "move", "rotate", "step_to", "sweep"]
 

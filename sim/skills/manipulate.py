@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Action, Arm
-from sim.failures import FailureCode, SkillFailure
-from sim.liquids import spill
-from sim.objects import ObjectInstance
+from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_pick, check_place
+from sim.skills.failures import FailureCode, SkillFailure
 from sim.skills.grasps import Grasp, grasp_candidates
+from sim.skills.plan_cache import remembered
 from sim.skills.reach import Reach, blame, explained, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
-from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.world.liquids import spill
 
 __all__ = [
     "Luck",

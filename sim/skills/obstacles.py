@@ -11,9 +11,9 @@ from typing import Final
 import mujoco
 import numpy as np
 
-from sim.navigation import NavigationMap, Rectangle
-from sim.scene import MOVABLE_BITS, STATIC_BITS
-from sim.world import World
+from sim.scene.compiler import MOVABLE_BITS, STATIC_BITS
+from sim.skills.navigation import NavigationMap, Rectangle
+from sim.world.world import World
 
 __all__ = ["navigation_map", "obstacle_rectangles"]
 

@@ -2,7 +2,7 @@
 
 Pour brings the vessel beside and above the target's opening, turns the hand about its own pointing axis (the last joint of the
 arm) until the vessel's axis is past the horizontal as far as the joint goes. The liquid then runs as it does from any tilted
-vessel (`sim.liquids.run_out`): into what is below the rim, or beside it. Paper: pouring and filling of DualTHOR, there
+vessel (`sim.world.liquids.run_out`): into what is below the rim, or beside it. Paper: pouring and filling of DualTHOR, there
 switches.
 """
 
@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Action, Arm
-from sim import liquids
-from sim.failures import FailureCode, SkillFailure
-from sim.objects import ObjectInstance
+from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_fill, check_pour
+from sim.skills.failures import FailureCode, SkillFailure
 from sim.skills.manipulate import Luck, nudge, plan_bring, stow
+from sim.skills.plan_cache import remembered
 from sim.skills.reach import Reach
-from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.world import liquids
 
 __all__ = ["assess_fill", "assess_pour", "fill", "pour"]
 

@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Action, Arm
-from sim.failures import FailureCode, SkillFailure
-from sim.navigation import Stance
-from sim.objects import MovingPart, ObjectInstance
+from sim.scene.objects import MovingPart, ObjectInstance
 from sim.skills.body import ArmGoal, Body, wait
 from sim.skills.clearance import TOUCH_M
 from sim.skills.door import Door
+from sim.skills.failures import FailureCode, SkillFailure
 from sim.skills.locomotion import step_to, sweep
 from sim.skills.manipulate import GRASP_GAP_M, stow
+from sim.skills.navigation import Stance
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach import Reach, route
 from sim.skills.reach_map import HandPose

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Arm
-from sim.failures import FailureCode, SkillFailure
 from sim.skills.body import REACH_TOLERANCE_M, ArmGoal, Body
+from sim.skills.failures import FailureCode, SkillFailure
 from sim.skills.reach_map import HandPose
 
 __all__ = ["Reach", "blame", "explained", "plan_reach", "route"]

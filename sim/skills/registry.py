@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from data.records import Action, PlanStep
-from sim.failures import FailureCode, SkillFailure
 from sim.skills import articulate, holding, locomotion, manipulate, pouring, set_down, tools, two_arm
 from sim.skills.body import Body
+from sim.skills.failures import FailureCode, SkillFailure
 from sim.skills.manipulate import Luck
 from sim.skills.push import Push
 from sim.skills.runner import Skill, refuse

@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Final
 
 from data.records import Action, ActionOutcome
-from sim.failures import FailureCode, SkillFailure, failed, succeeded
+from sim.skills.failures import FailureCode, SkillFailure, failed, succeeded
 
 __all__ = ["CONTROL_DT_S", "Skill", "run_skills"]
 

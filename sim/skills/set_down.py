@@ -17,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Action, Arm
-from sim.failures import FailureCode, SkillFailure
-from sim.objects import ObjectInstance
+from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body, BothGoal, wait
 from sim.skills.checks import check_place_both
 from sim.skills.clearance import TOUCH_M
+from sim.skills.failures import FailureCode, SkillFailure
 from sim.skills.manipulate import Luck, upright
+from sim.skills.plan_cache import remembered
 from sim.skills.reach import blame
 from sim.skills.reach_map import HandPose
-from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.skills.two_arm import BOTH_TOLERANCE_M, against_sag, hands_m
 

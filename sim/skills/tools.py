@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Action, Arm
-from sim.failures import FailureCode, SkillFailure
-from sim.liquids import wipe
-from sim.objects import ObjectInstance
+from sim.scene.objects import ObjectInstance
 from sim.skills.articulate import plan_press
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_clean, check_slice, check_use_up
+from sim.skills.failures import FailureCode, SkillFailure
 from sim.skills.manipulate import GRASP_GAP_M, Luck, nudge, plan_bring, stow
+from sim.skills.plan_cache import remembered
 from sim.skills.reach import Reach
-from sim.skills.remembered import remembered
 from sim.skills.runner import Skill
+from sim.world.liquids import wipe
 
 __all__ = ["assess_clean", "assess_slice", "assess_use_up", "clean", "slice_object", "use_up"]
 

@@ -14,17 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.records import Action, Arm
-from sim.failures import FailureCode, SkillFailure
-from sim.liquids import spill
-from sim.objects import ObjectInstance
+from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body, BothGoal, wait
 from sim.skills.checks import check_lift
+from sim.skills.failures import FailureCode, SkillFailure
 from sim.skills.grasps import solid_box
 from sim.skills.manipulate import GRASP_GAP_M, Luck
+from sim.skills.plan_cache import remembered
 from sim.skills.reach import blame, route
 from sim.skills.reach_map import HandPose
-from sim.skills.remembered import remembered
 from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.world.liquids import spill
 
 __all__ = ["BOTH_TOLERANCE_M", "against_sag", "assess_lift", "hands_m", "lift"]
 

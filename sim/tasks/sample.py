@@ -15,18 +15,18 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.catalogue import ObjectType, load_catalogue
-from sim.navigation import NavigationMap, Rectangle
-from sim.placement import OVERHANG_SHARE, fits_on
 from sim.robots.build_solver import robot_kit
 from sim.robots.spec import load_robot
-from sim.rooms import Furniture, load_room, room_names
+from sim.scene.catalogue import ObjectType, load_catalogue
+from sim.scene.rooms import Furniture, load_room, room_names
+from sim.skills.navigation import NavigationMap, Rectangle
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach_map import reach_maps
 from sim.tasks.drafts import Draft, NoDraft, Scene
 from sim.tasks.families import CATEGORIES, FAMILIES, draw, family_of
 from sim.tasks.task import Placement, Start, Task
-from sim.world import World, WorldError
+from sim.world.placement import OVERHANG_SHARE, fits_on
+from sim.world.world import World, WorldError
 
 __all__ = [
     "BENCHMARK_SEEDS",

@@ -10,7 +10,7 @@ from configs.compose import CONFIG_DIR, compose, groups
 from configs.schema.eval import EvalConfig
 from configs.schema.train import TrainConfig
 from configs.validate import ConfigError, build
-from sim.contingency import load_contingency
+from sim.session.contingency import load_contingency
 
 ROOTS = {"train": TrainConfig, "eval": EvalConfig}
 #: Which root a group belongs to; `contingency` is data that the simulator reads.

@@ -9,7 +9,7 @@ import pytest
 
 from data.records import Action, ActionKind, FailureCategory
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, Deciding, attribute, deciding_failure, unmet_objects
-from sim.failures import FailureCode, category_of
+from sim.skills.failures import FailureCode, category_of
 from sim.tasks.task import load_benchmark
 
 

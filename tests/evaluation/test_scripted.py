@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data.records import ActionKind, FailureCategory, Outcome, PlanStep
-from proprio_mllm.evaluation.faults import CAUSES, LATE_SLIPS, SLIPS, FaultyPlanner
+from proprio_mllm.evaluation.fault_injection import CAUSES, LATE_SLIPS, SLIPS, FaultyPlanner
 from proprio_mllm.evaluation.privileged import PrivilegedPlanner
 from proprio_mllm.evaluation.scripted import Cell, CellRunner, cells, drawn, read_plans
 from proprio_mllm.planners.protocol import Planner, TaskInfo

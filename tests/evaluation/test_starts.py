@@ -15,7 +15,7 @@ from proprio_mllm.evaluation.starts import CLEARANCE_M, random_start, started
 from sim.robots.spec import load_robot
 from sim.skills.obstacles import navigation_map
 from sim.tasks.task import Task, load_benchmark, write_tasks
-from sim.world import World, WorldError
+from sim.world.world import World, WorldError
 
 TASK = load_benchmark()[0]
 

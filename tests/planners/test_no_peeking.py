@@ -25,7 +25,7 @@ from proprio_mllm.planners.mllm import MllmPlanner
 from proprio_mllm.planners.protocol import Planner
 from proprio_mllm.planners.random_planner import RandomPlanner
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
-from sim.session import Session
+from sim.session.session import Session
 from sim.tasks.predicates import Predicate
 from sim.tasks.task import Placement, Start, Task
 from tests.planners.chat.dag_plan.graphs import node, reply

@@ -14,7 +14,7 @@ from data.records import EpisodeRecord, FailureCategory, Outcome
 from proprio_mllm.report import figures
 from proprio_mllm.report.figures import failure_figure, plot_failures, task_distribution
 from proprio_mllm.report.summary import Row, rows_of
-from sim.catalogue import load_catalogue
+from sim.scene.catalogue import load_catalogue
 from sim.tasks.predicates import Predicate
 from sim.tasks.task import Placement, Task, load_benchmark
 

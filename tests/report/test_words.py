@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from proprio_mllm.report.words import code_in_words, goal_in_words, margins_in_words
-from sim.failures import FAILURES, FailureCode
+from sim.skills.failures import FAILURES, FailureCode
 from sim.tasks.predicates import Predicate
 from sim.tasks.task import load_benchmark
 

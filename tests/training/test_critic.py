@@ -10,8 +10,8 @@ import pytest
 
 from configs.schema.model import ModelConfig
 from proprio_mllm.training.critic import Judge, Trajectory, actor_examples, audit, critic_examples, keep
+from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.goals import Relabel
-from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.rollouts import Moment, Rollout
 from proprio_mllm.training.sources import Demos
 

@@ -12,7 +12,7 @@ from proprio_mllm.evaluation.sessions import SimSession
 from proprio_mllm.planners.chat.llm_planner import LlmPlanner
 from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.chat.rap import Outline, RapPlanner, Thought
-from sim.session import Session
+from sim.session.session import Session
 from tests.planners.chat.script import Script, plan, thought
 from tests.planners.test_no_peeking import TASK, Kept, Scrambled, episode
 

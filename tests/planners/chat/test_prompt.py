@@ -10,7 +10,7 @@ from PIL import Image
 from data.records import ACTIONS, HistoryItem
 from proprio_mllm.planners.chat.manual import CODES, DESCRIPTIONS, action_manual, code_manual, role
 from proprio_mllm.planners.chat.view import body_text, encoded, log_text, scene_text
-from sim.failures import FailureCode
+from sim.skills.failures import FailureCode
 from tests.planners.chat.script import observation
 
 

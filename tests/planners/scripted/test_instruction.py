@@ -8,7 +8,7 @@ import pytest
 
 from proprio_mllm.planners.scripted.instruction import Goal, read_goals
 from proprio_mllm.planners.scripted.words import Mention, candidates, find_mentions
-from sim.rooms import load_room
+from sim.scene.rooms import load_room
 from sim.tasks.instructions import TEMPLATES, phrase, preposition, wordings
 from sim.tasks.predicates import Predicate
 from sim.tasks.task import Task, load_benchmark

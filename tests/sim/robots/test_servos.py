@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.servos import figures, groups, response, standing
 from sim.robots.spec import available_robots, load_robot
-from sim.scene import TIMESTEP_S
+from sim.scene.compiler import TIMESTEP_S
 
 
 @pytest.mark.parametrize("robot", available_robots())

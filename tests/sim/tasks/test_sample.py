@@ -7,7 +7,7 @@ from sim.robots.spec import load_robot
 from sim.tasks.families import CATEGORIES
 from sim.tasks.sample import BENCHMARK_SEEDS, ROBOTS, ROOMS, TRAIN_ROOMS, TRAIN_SEEDS, sample_task, scene_of, start_height_m
 from sim.tasks.task import Task
-from sim.world import World
+from sim.world.world import World
 
 SEED = TRAIN_SEEDS.start
 

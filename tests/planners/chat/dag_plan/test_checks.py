@@ -11,7 +11,7 @@ from proprio_mllm.planners.chat.dag_plan.checks import GraphError, check_graph
 from proprio_mllm.planners.chat.dag_plan.graph import NodeReply
 from proprio_mllm.planners.chat.dag_plan.names import Vocabulary, bindings
 from proprio_mllm.planners.furniture import FIXTURES
-from sim.catalogue import load_catalogue
+from sim.scene.catalogue import load_catalogue
 from tests.planners.chat.dag_plan.graphs import carried, graph, node
 
 TAKE = node("a", "Pick(Mug_1)", at="CounterTop_1")

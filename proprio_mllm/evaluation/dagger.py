@@ -1,0 +1,134 @@
+"""Corrections (DAgger): a model acts on training tasks and the expert names the step it would have taken in each state.
+
+Demonstrations hardly show what follows a learned planner's own mistakes: placing with an empty hand, picking up what it holds,
+asking for an object it has not seen, going where it stands. The base model's mistakes, each with the expert's next step, join
+the demonstrations of stages 2 and 3, and those in words alone (`sim.collection.text_world`), which cost a fiftieth, the
+exercises. This is the bridge that `train.py` wires: training asks with a `CorrectionRequest` and reads `demos` or `exercises`
+shards.
+
+Part files are a function of the request and their number, so a run can be killed and continued. The paper has no such data; its
+pretrained backbone reads feedback in plain words already.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from tqdm import tqdm
+
+from configs.schema.collect import CollectConfig
+from data.records import Observation, PlanStep
+from data.shards import ShardWriter
+from data.workers import start_worker
+from proprio_mllm.training.rollouts import CorrectionRequest
+
+if TYPE_CHECKING:
+    from proprio_mllm.planners.mllm import MllmPlanner
+
+__all__ = ["collect_corrections", "student_in_words"]
+
+#: Episodes of a part; those in words go side by side.
+_PER_PART: Final[dict[str, int]] = {"demos": 10, "exercises": 50}
+
+
+def collect_corrections(request: CorrectionRequest, robots: Sequence[str] = ("h1", "x1"), workers: int = 2) -> None:
+    """Lets the model act and writes a complete shard folder; an interrupted one is continued part by part.
+
+    Args:
+        request: the model, how many episodes, and where they go.
+        robots: robots, in turn.
+        workers: processes; 1 stays in this one.
+    """
+    writer = ShardWriter(request.folder, request.kind, request.config_hash, overwrite=True)
+    size = _PER_PART[request.kind]
+    config = CollectConfig(
+        request.kind, str(request.folder), request.episodes, tuple(robots), seed=request.seed, image_size=request.image_size,
+        part_size=size, noise=request.expert_share,
+    )  # fmt: skip
+    count = -(-request.episodes // size)
+    missing = writer.missing(count)
+    with tqdm(total=count, initial=count - len(missing), desc=f"corrections ({request.kind})", unit="part") as bar:
+        for part, rows in _computed(config, missing, str(request.model), workers):
+            writer.write(part, rows)
+            bar.update(1)
+    writer.finish({"student": str(request.model), "expert_share": request.expert_share})
+
+
+def _computed(
+    config: CollectConfig, missing: Sequence[int], model: str, workers: int
+) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    """Parts as they are finished."""
+    if workers == 1 or len(missing) < 2:
+        for part in missing:
+            with _one_thread():
+                rows = _part(config, part, model)
+            yield part, rows
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(missing)), mp_context=context, initializer=start_worker) as pool:
+        futures = {pool.submit(_part, config, part, model): part for part in missing}
+        for future in as_completed(futures):
+            yield futures.pop(future), future.result()
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """One torch thread, as in a worker process: the number of threads decides the order of sums, and training has its own."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _part(config: CollectConfig, part: int, model: str) -> list[dict[str, Any]]:
+    """One part; imports simulator and model only here, so that workers start light."""
+    if config.kind == "exercises":
+        from sim.collection.text_world import corrections_of_part as in_words
+
+        return list(in_words(config, part, student_in_words(model)))
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from sim.collection.demonstrations import corrections_of_part
+
+    return list(corrections_of_part(config, part, _student(model)))
+
+
+@functools.cache
+def _planner(model: str) -> MllmPlanner:
+    import torch
+
+    from proprio_mllm.planners.mllm import MllmPlanner
+
+    torch.set_num_threads(1)
+    return MllmPlanner.load(Path(model))
+
+
+def _student(model: str) -> Callable[[Observation], PlanStep | None]:
+    """The model's step for what it sees."""
+    return lambda observation: _planner(model).step(observation, None).step
+
+
+def student_in_words(model: str) -> Callable[[Sequence[Mapping[str, Any]]], list[PlanStep | None]]:
+    """The model in a folder as a student of `sim.collection.text_world`: greedy steps for moments in words."""
+    from proprio_mllm.model.batch import Example
+    from proprio_mllm.planners.protocol import parse_reply
+    from proprio_mllm.training.asking import LONGEST_STEP, replies
+    from proprio_mllm.training.sources import step_in_words
+
+    reader = _planner(model).model
+
+    def steps(moments: Sequence[Mapping[str, Any]]) -> list[PlanStep | None]:
+        asked = [Example(step_in_words(moment, None, reader.cfg)) for moment in moments]
+        return [parse_reply(text).step for text in replies(reader, asked, LONGEST_STEP)]
+
+    return steps

@@ -1,0 +1,1 @@
+"""Making of the 359 tasks: sampling, composition and the expert's certificates."""

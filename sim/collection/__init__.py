@@ -1,0 +1,1 @@
+"""Training data out of the simulator: views, text planning, demonstrations, replayed motion."""

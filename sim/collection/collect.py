@@ -1,0 +1,146 @@
+"""Collects training shards: posed views and demonstrations of the expert from the simulator, and exercises in words.
+
+    python -m sim.collection.collect kind=views out=outputs/views count=4800 workers=2
+    python -m sim.collection.collect kind=demos out=outputs/demos count=600 workers=2
+
+A part file is a function of the configuration and its index only, so runs may be interrupted, resumed and spread over processes
+without changing a byte. Paper: the planning demonstrations and views that the open stages train on; the paper starts from
+pretrained weights instead.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import multiprocessing
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from configs.arguments import read_arguments
+from configs.schema.collect import CollectConfig
+from configs.validate import ConfigError
+from data.shards import Manifest, ShardWriter, config_hash
+from data.workers import start_worker
+
+__all__ = ["collect", "main", "parts_of", "rows_of_part"]
+
+_LOG = logging.getLogger(__name__)
+
+#: Raised when the meaning of a configuration changes, so that old shards are not continued.
+_VERSION = {"views": 2, "demos": 3, "exercises": 3, "judgements": 3}
+_IN_WORDS = ("out", "workers", "views_per_world", "image_size", "noise", "medium_share")
+#: Fields that do not change what is written.
+_UNKEYED = {
+    "views": ("out", "workers", "noise", "medium_share"),
+    "demos": ("out", "workers", "views_per_world"),
+    "exercises": _IN_WORDS,
+    "judgements": _IN_WORDS,
+}
+
+
+def parts_of(config: CollectConfig) -> int:
+    """Number of part files of a configuration."""
+    return -(-config.count // config.part_size)
+
+
+def rows_of_part(config: CollectConfig, part: int) -> list[dict[str, Any]]:
+    """Computes one part; imports the simulator only here, so that workers start light."""
+    if config.kind == "views":
+        from sim.collection.view_sampling import views_of_part
+
+        return list(views_of_part(config, part))
+    if config.kind == "exercises":
+        from sim.collection.text_world import exercises_of_part
+
+        return list(exercises_of_part(config, part))
+    if config.kind == "judgements":
+        from sim.collection.text_world import judgements_of_part
+
+        return list(judgements_of_part(config, part))
+    from sim.collection.demonstrations import demos_of_part
+
+    return list(demos_of_part(config, part))
+
+
+def collect(config: CollectConfig, progress: Callable[[int, int], None] | None = None, overwrite: bool = False) -> Manifest:
+    """Writes a shard folder, continuing one that was interrupted.
+
+    Args:
+        config: what to collect.
+        progress: called with (parts done, parts in all).
+        overwrite: start over when the folder holds shards of another configuration.
+
+    Raises:
+        data.shards.ShardError: when the folder holds something else and `overwrite` is off.
+    """
+    keyed = {k: v for k, v in dataclasses.asdict(config).items() if k not in _UNKEYED[config.kind]} | {
+        "version": _VERSION[config.kind]
+    }
+    writer = ShardWriter(Path(config.out), config.kind, config_hash(keyed), overwrite)
+    total = parts_of(config)
+    missing = writer.missing(total)
+    done = total - len(missing)
+    report = progress or (lambda finished, parts: _LOG.info("%s: %d of %d parts", config.out, finished, parts))
+    report(done, total)
+    for part, rows in _computed(config, missing):
+        writer.write(part, rows)
+        done += 1
+        report(done, total)
+    return writer.finish({"config": keyed, **_metadata(config)})
+
+
+def _metadata(config: CollectConfig) -> dict[str, Any]:
+    if config.kind != "views":
+        return {}
+    from sim.collection.view_sampling import type_names
+
+    return {"type_names": list(type_names())}
+
+
+def _computed(config: CollectConfig, missing: Sequence[int]) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    """Parts as they are finished: in this process, or in spawned ones (the OpenGL context does not survive a fork)."""
+    if config.workers == 1 or len(missing) < 2:
+        for part in missing:
+            yield part, rows_of_part(config, part)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(config.workers, len(missing)), mp_context=context, initializer=start_worker) as pool:
+        futures = {pool.submit(rows_of_part, config, part): part for part in missing}
+        for future in as_completed(futures):
+            yield futures.pop(future), future.result()
+
+
+def _with_bar(run: Callable[[Callable[[int, int], None]], Manifest], title: str) -> Manifest:
+    columns = (
+        TextColumn(title),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("parts"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns) as bar:
+        task = bar.add_task(title)
+        return run(lambda done, total: bar.update(task, completed=done, total=total))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    try:
+        config = read_arguments(CollectConfig, sys.argv[1:] if arguments is None else arguments)
+    except ConfigError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    manifest = _with_bar(lambda report: collect(config, report), config.kind)
+    facts: Mapping[str, Any] = {"rows": manifest.rows, "parts": len(manifest.parts), "config_hash": manifest.config_hash}
+    sys.stdout.write(f"{config.out}: {facts}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,242 @@
+"""Episodes of the expert on sampled tasks, with exploration noise: the rows of `demos` shards.
+
+With some probability a perturbed step is executed instead of the expert's, while the expert's choice is what is recorded
+(as in DAgger), and some episodes run at medium difficulty; both lead into states that a learned planner will meet and that the
+expert alone would never visit. Episodes that do not end in success are dropped as a whole, so every recorded step led, or could
+have led, to the goal. Paper: planning demonstrations; what the paper takes from pretraining.
+
+With a student, its steps are executed in place of the expert's (DAgger, Ross et al. 2011): what is recorded is what the expert
+would do where a learned planner's own mistakes have led it. The student gets no say where it repeats a step that just failed or
+ends the episode, in a share of the steps, and after as many steps as the task allows; the expert then finishes the episode.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+
+from configs.schema.collect import CollectConfig
+from data.records import Action, ActionKind, Observation, PlanStep
+from data.shards import encode_png
+from sim.collection.students import accepted
+from sim.expert.expert import Expert
+from sim.session.session import Session
+from sim.tasks.sample import TRAIN_SEEDS, rng_for, sample_task
+from sim.tasks.task import Task
+
+__all__ = ["Episode", "Student", "corrections_of_part", "demos_of_part", "perturbed", "run_correction", "run_episode"]
+
+#: Plays one episode of a collection with the sessions it may reuse.
+Play = Callable[[CollectConfig, int, dict[tuple[str, str], Session]], "Episode"]
+#: A planner that learns: the step it would take, None when its reply is no step.
+Student = Callable[[Observation], PlanStep | None]
+
+#: Training seeds of one collection seed; two collections do not share tasks.
+_SEEDS_PER_COLLECTION: Final = 1_000_000
+#: The expert gives an episode up when it has thought about this many stances: four fifths of the time went into episodes that
+#: failed in the end and were dropped.
+_REHEARSALS: Final = 6
+#: The same where a student leads the robot astray, and the steps that the expert has for finishing after it.
+_STUDENT_REHEARSALS: Final = 16
+_FINISH: Final = 10
+#: Episodes with a student take their tasks from here on, so that they share none with the expert's own.
+_STUDENT_FROM: Final = 500_000
+
+
+@dataclass(slots=True)
+class Episode:
+    """What came of one episode.
+
+    Attributes:
+        rows: one per step, ready for a shard.
+        success: whether the goals held at the end.
+        steps: steps taken.
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    success: bool = False
+    steps: int = 0
+
+
+def demos_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
+    """Rows of one part of a `demos` folder; the same for the same configuration, whoever computes it."""
+    yield from _rows_of_part(config, part, run_episode)
+
+
+def run_episode(config: CollectConfig, index: int, sessions: dict[tuple[str, str], Session] | None = None) -> Episode:
+    """Plays one episode.
+
+    Args:
+        config: the collection.
+        index: number of the episode; names its task, robot and every draw.
+        sessions: sessions by (robot, difficulty), reused between episodes.
+    """
+    rng = rng_for("demos", config.seed, index)
+    robot, task, session, observation = _start(config, index, rng, {} if sessions is None else sessions)
+    expert = Expert(session, rehearsals=_REHEARSALS)
+    expert.reset()
+    episode = Episode()
+    while not session.finished:
+        target = expert.next_step()
+        step, origin = target, "expert"
+        if rng.random() < config.noise:
+            step, origin = perturbed(target, observation, rng, expert.intent)
+        episode.rows.append(_row(observation, task, robot, index, target, {"executed": step.to_text(), "origin": origin}))
+        if target.actions[0].name == "Done":
+            break
+        observation, _ = session.step(step)
+    episode.success, episode.steps = session.succeeded, len(episode.rows)
+    return episode
+
+
+def corrections_of_part(config: CollectConfig, part: int, student: Student) -> Iterator[dict[str, Any]]:
+    """Rows of one part of a `demos` folder whose steps the student chose and the expert corrected."""
+    yield from _rows_of_part(config, part, lambda cfg, index, sessions: run_correction(cfg, index, sessions, student))
+
+
+def _rows_of_part(config: CollectConfig, part: int, play: Play) -> Iterator[dict[str, Any]]:
+    sessions: dict[tuple[str, str], Session] = {}
+    try:
+        for index in config.indices(part):
+            episode = play(config, index, sessions)
+            if episode.success:
+                yield from episode.rows
+    finally:
+        for session in sessions.values():
+            session.close()
+
+
+def run_correction(
+    config: CollectConfig, index: int, sessions: dict[tuple[str, str], Session] | None, student: Student
+) -> Episode:
+    """Plays one episode in which a student acts and the expert names the step it would have taken.
+
+    Args:
+        config: the collection; `noise` is the share of steps that the expert takes itself.
+        index: number of the episode.
+        sessions: sessions by (robot, difficulty), reused between episodes.
+        student: the learned planner.
+    """
+    rng = rng_for("corrections", config.seed, index)
+    sessions = {} if sessions is None else sessions
+    robot, task, session, observation = _start(config, _STUDENT_FROM + index, rng, sessions, _FINISH)
+    expert = Expert(session, rehearsals=_STUDENT_REHEARSALS)
+    expert.reset()
+    episode = Episode()
+    while not session.finished:
+        target = expert.next_step()
+        step, origin = target, "expert"
+        if rng.random() >= config.noise and session.stats.charged < task.step_budget - _FINISH:
+            proposed = accepted(student(observation), observation.history[-1] if observation.history else None)
+            if proposed is not None:
+                step, origin = proposed, "student"
+        executed = {"executed": step.to_text(), "origin": origin}
+        episode.rows.append(_row(observation, task, robot, _STUDENT_FROM + index, target, executed))
+        if target.actions[0].name == "Done":
+            break
+        observation, _ = session.step(step)
+    episode.success, episode.steps = session.succeeded, len(episode.rows)
+    return episode
+
+
+def _start(
+    config: CollectConfig,
+    index: int,
+    rng: np.random.Generator,
+    sessions: dict[tuple[str, str], Session],
+    extra_steps: int = 0,
+) -> tuple[str, Task, Session, Observation]:
+    """Opens the episode's task."""
+    robot = config.robots[index % len(config.robots)]
+    room = config.rooms[(index // len(config.robots)) % len(config.rooms)]
+    task = sample_task(TRAIN_SEEDS.start + config.seed * _SEEDS_PER_COLLECTION + index, room, robots=(robot,))
+    task = replace(task, step_budget=task.step_budget + extra_steps)
+    difficulty = "medium" if rng.random() < config.medium_share else "easy"
+    session = sessions.setdefault((robot, difficulty), Session(robot, difficulty, config.image_size))
+    return robot, task, session, session.reset(task, seed=task.seed)
+
+
+def perturbed(
+    step: PlanStep, observation: Observation, rng: np.random.Generator, intent: Action | None = None
+) -> tuple[PlanStep, str]:
+    """A step that goes a little or entirely wrong, and the name of what was done to it.
+
+    Args:
+        step: the right step.
+        observation: what the planner saw before it.
+        rng: draws.
+        intent: the arm action that the step works towards; `hasty` tries it at once, as learned planners do, so that the
+            demonstrations show what follows each kind of refusal.
+    """
+    kinds: list[str] = ["wander", "height"]
+    head = step.actions[0]
+    if intent is not None and head.spec.kind is ActionKind.BODY:
+        kinds += ["hasty"] * 5
+    if head.amount is not None:
+        kinds += ["amount"] * 2
+    if head.spec.kind is ActionKind.ARM:
+        kinds += ["arm"]
+    if len(step.actions) == 2:
+        kinds += ["half"] * 2
+    if observation.known_objects:
+        kinds += ["detour"] * 2
+    kind = str(rng.choice(kinds))
+    if kind == "hasty" and intent is not None:
+        return PlanStep((intent,)), kind
+    return PlanStep((_perturbation(kind, step, observation.known_objects, rng),)), kind
+
+
+def _perturbation(kind: str, step: PlanStep, known: Sequence[str], rng: np.random.Generator) -> Action:
+    head = step.actions[0]
+    if kind == "amount":
+        assert head.amount is not None
+        low, high = head.spec.amount_range
+        unit = 5.0 if head.spec.amount_unit == "deg" else 0.05
+        factor = float(rng.choice((0.4, 0.7, 1.5, 2.0)))
+        amount = float(np.clip(round(factor * head.amount / unit) * unit, max(low, unit), high))
+        return Action(head.name, object_id=head.object_id, amount=round(amount, 2), bearing_deg=head.bearing_deg)
+    if kind == "arm":
+        assert head.arm is not None
+        return Action(head.name, arm=head.arm.other, object_id=head.object_id)
+    if kind == "half":
+        return step.actions[int(rng.integers(2))]
+    if kind == "detour":
+        return Action("GoTo", object_id=str(rng.choice(sorted(known))))
+    if kind == "height":
+        return Action(str(rng.choice(("MoveUp", "MoveDown"))), amount=round(0.05 * float(rng.integers(1, 6)), 2))
+    name = str(rng.choice(("MoveAhead", "MoveBack", "MoveLeft", "MoveRight", "RotateLeft", "RotateRight")))
+    amount = 15.0 * float(rng.integers(1, 7)) if name.startswith("Rotate") else 0.1 * float(rng.integers(1, 6))
+    return Action(name, amount=round(amount, 2))
+
+
+def _row(
+    observation: Observation, task: Task, robot: str, index: int, target: PlanStep, privileged: dict[str, Any]
+) -> dict[str, Any]:
+    body = observation.proprioception
+    return {
+        "episode": f"{task.id}_{robot}_{index}",
+        "task": task.id,
+        "split": task.split,
+        "category": task.category,
+        "robot": robot,
+        "room": task.room,
+        "step": observation.step,
+        "step_budget": observation.step_budget,
+        "instruction": observation.instruction,
+        "image": encode_png(observation.image),
+        "intrinsics": observation.camera.intrinsics.ravel().tolist(),
+        "camera_in_pelvis": observation.camera.camera_in_pelvis.ravel().tolist(),
+        "height": observation.camera.height,
+        "width": observation.camera.width,
+        "motion": body.motion.ravel(),
+        "key_bodies": body.key_bodies_in_pelvis.ravel().tolist(),
+        "visible": list(observation.visible_objects),
+        "known": list(observation.known_objects),
+        "history": [{"step": item.step, "feedback": item.feedback} for item in observation.history],
+        "target": target.to_text(),
+        "privileged": json.dumps(privileged | {"family": task.family}),
+    }

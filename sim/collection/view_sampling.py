@@ -1,0 +1,259 @@
+"""Views of posed robots: kinematics and a camera, no physics. The material of dense pretraining and of the point-map encoder.
+
+A world is furnished at random, then the robot is put into many poses: places, headings, pelvis heights with the matching legs,
+arms and hands. Each view comes with depth, segmentation by type, what is visible where, and a motion window that leads into the
+pose, so that a view has proprioception like any observation. Paper: the visual pretraining that a large model brings along.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from configs.schema.collect import CollectConfig
+from data.motion import encode_frames, world_to_heading
+from data.records import Arm
+from data.shards import encode_png
+from sim.robots.build_solver import robot_kit
+from sim.robots.spec import SIDES
+from sim.scene.catalogue import load_catalogue
+from sim.scene.compiler import BASE_JOINTS
+from sim.skills.body import ready_posture
+from sim.skills.obstacles import navigation_map
+from sim.tasks.drafts import NoDraft
+from sim.tasks.families import FAMILIES, draw
+from sim.tasks.sample import UNSEEN_TYPES, rng_for, scene_of
+from sim.tasks.task import Placement
+from sim.world.recorder import HISTORY_FRAMES
+from sim.world.rendering import Renderer, View
+from sim.world.world import World, WorldError
+
+__all__ = ["Pose", "camera_in_pelvis", "draw_pose", "set_pose", "type_names", "view_row", "views_of_part", "visible_json"]
+
+Array = NDArray[np.float64]
+
+_KEY_INSTANTS: Final = 7
+_FACING_SHARE: Final = 0.7
+_FACING_DISTANCE_M: Final = (0.3, 2.3)
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """A robot's posture in the world.
+
+    Attributes:
+        x_m, y_m, yaw_rad: base.
+        height_m: pelvis.
+        joints: arm and hand joints by name.
+    """
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    height_m: float
+    joints: Mapping[str, float]
+
+    def towards(self, other: Pose, share: float) -> Pose:
+        """The pose at `share` (0..1) of the way to another."""
+
+        def mix(a: float, b: float) -> float:
+            return a + share * (b - a)
+
+        turn = (other.yaw_rad - self.yaw_rad + np.pi) % (2.0 * np.pi) - np.pi
+        joints = {name: mix(value, other.joints[name]) for name, value in self.joints.items()}
+        return Pose(
+            mix(self.x_m, other.x_m), mix(self.y_m, other.y_m), self.yaw_rad + share * float(turn),
+            mix(self.height_m, other.height_m), joints,
+        )  # fmt: skip
+
+
+def type_names() -> tuple[str, ...]:
+    """Names of the object types in the order of the segmentation's indices."""
+    return tuple(load_catalogue().types)
+
+
+def set_pose(world: World, pose: Pose) -> None:
+    """Puts the robot into a pose: base, legs that fit the pelvis height, arms and hands; kinematics only."""
+    assert world.robot is not None
+    crouches = robot_kit(world.robot).crouches
+    base = dict(zip(BASE_JOINTS, (pose.x_m, pose.y_m, pose.height_m, pose.yaw_rad, crouches.pitch(pose.height_m)), strict=True))
+    legs = dict(zip(world.robot.leg_joints, map(float, crouches.legs(pose.height_m)), strict=True))
+    for name, value in (base | legs | dict(pose.joints)).items():
+        world.data.qpos[world.model.joint(name).qposadr[0]] = value
+    mujoco.mj_kinematics(world.model, world.data)
+
+
+def draw_pose(world: World, free: Array, rng: np.random.Generator) -> Pose:
+    """A free place, mostly facing something, any pelvis height, arms ready, as between actions, raised or anywhere."""
+    robot = world.robot
+    assert robot is not None
+    x, y = free[int(rng.integers(len(free)))]
+    yaw = float(rng.uniform(-np.pi, np.pi))
+    if rng.random() < _FACING_SHARE:
+        names = list(world.objects)
+        movable = [name for name in names if world.objects[name].movable]
+        pool = movable if movable and rng.random() < 0.6 else names
+        target = world.center(pool[int(rng.integers(len(pool)))])[:2]
+        gaps = np.linalg.norm(free - target, axis=1)
+        near = free[(gaps > _FACING_DISTANCE_M[0]) & (gaps < _FACING_DISTANCE_M[1])]
+        if len(near):
+            x, y = near[int(rng.integers(len(near)))]
+            yaw = float(np.arctan2(target[1] - y, target[0] - x) + rng.normal(0.0, 0.3))
+    low, high = robot.pelvis_height_range_m
+    height = high if rng.random() < 0.3 else float(rng.uniform(low, high))
+    joints: dict[str, float] = {}
+    for side in SIDES:
+        arm = robot.arms[side]
+        rest, carry = np.asarray(arm.rest), np.asarray(arm.carry)
+        kind = rng.random()
+        ready = ready_posture(robot_kit(robot), Arm(side))
+        posture = ready if kind < 0.55 else rest + rng.random() * (carry - rest)
+        if kind > 0.75:
+            limits = np.array([world.model.joint(name).range for name in arm.joints])
+            posture = rest + rng.uniform(0.0, 0.6) * (rng.uniform(limits[:, 0], limits[:, 1]) - rest)
+        opening = 1.0 if rng.random() < 0.6 else float(rng.random())
+        closed, opened = np.asarray(arm.hand_closed), np.asarray(arm.hand_open)
+        joints |= dict(zip(arm.joints, map(float, posture), strict=True))
+        joints |= dict(zip(arm.hand_joints, map(float, closed + opening * (opened - closed)), strict=True))
+    return Pose(float(x), float(y), yaw, height, joints)
+
+
+def lead_in(world: World, before: Pose, pose: Pose, rng: np.random.Generator) -> NDArray[np.float32]:
+    """(T, F) motion features of a smooth way from `before` to `pose` and a rest there; leaves the robot in `pose`.
+
+    Kinematics are evaluated at a few instants and interpolated between them.
+    """
+    recorder = world.recorder
+    assert recorder is not None
+    frames: list[tuple[Array, ...]] = []
+    for share in np.linspace(0.0, 1.0, _KEY_INSTANTS):
+        set_pose(world, before.towards(pose, float(share)))
+        frames.append((recorder.root_pose(world.data), recorder.hands(world.data), recorder.key_bodies(world.data)))
+    moving = int(rng.integers(8, 40))
+    wait = int(rng.integers(0, 12))
+    time = np.clip((np.arange(HISTORY_FRAMES) - (HISTORY_FRAMES - 1 - wait - moving)) / moving, 0.0, 1.0)
+    at = (_KEY_INSTANTS - 1) * time * time * (3.0 - 2.0 * time)
+    low = np.minimum(at.astype(int), _KEY_INSTANTS - 2)
+    weight = at - low
+
+    def blend(index: int) -> Array:
+        values = np.stack([frame[index] for frame in frames])
+        w = weight.reshape(-1, *([1] * (values.ndim - 1)))
+        return values[low] * (1.0 - w) + values[low + 1] * w
+
+    root, hands, keys = blend(0), blend(1), blend(2)
+    root[:, 3:] /= np.linalg.norm(root[:, 3:], axis=1, keepdims=True)
+    return encode_frames(root, keys, hands)
+
+
+def camera_in_pelvis(world: World, view: View) -> Array:
+    """(4, 4) pose of a view's camera in the pelvis heading frame."""
+    x, y, z, yaw = world.base_pose[:4]
+    c, s = np.cos(yaw), np.sin(yaw)
+    pelvis = np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]])
+    return np.linalg.inv(pelvis) @ view.camera_in_world
+
+
+def visible_json(world: World, segmentation: NDArray[np.int32]) -> str:
+    """What a view shows: id, type, centre in the pelvis heading frame (m), pixels and bounding box (x0, y0, x1, y1)."""
+    root = np.array([*world.base_pose[:3], np.cos(world.base_pose[3] / 2), 0.0, 0.0, np.sin(world.base_pose[3] / 2)])
+    ids = list(world.objects)
+    found: list[dict[str, Any]] = []
+    for index in np.unique(segmentation[segmentation >= 0]):
+        rows, columns = np.nonzero(segmentation == index)
+        center = world_to_heading(world.center(ids[index])[None], root)[0]
+        found.append({
+            "id": ids[index],
+            "type": world.objects[ids[index]].type.name,
+            "center_in_pelvis": [round(float(value), 4) for value in center],
+            "pixels": len(rows),
+            "bbox": [int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1],
+        })  # fmt: skip
+    return json.dumps(found)
+
+
+def view_row(world: World, view: View, motion: NDArray[np.float32], seed: int) -> dict[str, Any]:
+    """One row of a `views` shard."""
+    assert view.depth is not None
+    assert view.segmentation is not None
+    assert world.robot is not None
+    names = {name: index for index, name in enumerate(type_names())}
+    lookup = np.array([names[thing.type.name] for thing in world.objects.values()] + [-1, -1], dtype=np.int16)
+    height, width = view.depth.shape
+    return {
+        "image": encode_png(view.rgb),
+        "depth": np.clip(view.depth, 0.0, 60000.0).astype("<f2").tobytes(),
+        "segmentation": lookup[view.segmentation].astype("<i2").tobytes(),
+        "height": height,
+        "width": width,
+        "intrinsics": view.intrinsics.ravel().tolist(),
+        "camera_in_pelvis": camera_in_pelvis(world, view).ravel().tolist(),
+        "robot": world.robot.name,
+        "room": world.room.name,
+        "seed": seed,
+        "motion": motion.ravel(),
+        "objects": visible_json(world, view.segmentation),
+    }
+
+
+def _random_world(config: CollectConfig, index: int, rng: np.random.Generator) -> World:
+    """A room with the objects of two or three drafts, doors and switches in any state."""
+    robot = robot_kit(config.robots[index % len(config.robots)]).spec
+    room = config.rooms[(index // len(config.robots)) % len(config.rooms)]
+    scene = scene_of(room)
+    for _ in range(60):
+        try:
+            draft = draw(str(rng.choice(list(FAMILIES))), scene, rng, distractors=(4, 9), without=UNSEEN_TYPES)
+            placements = [
+                Placement(name, name.rsplit("_", 1)[0], carrier, yaw_deg=float(rng.uniform(0.0, 360.0)))
+                for name, carrier in draft.objects.items()
+            ]
+            states: dict[str, dict[str, bool | float | str]] = {}
+            for name in scene.containers:
+                if rng.random() < 0.35:
+                    states.setdefault(name, {})["openness"] = float(rng.uniform(0.3, 1.0))
+            for name in scene.switches:
+                states.setdefault(name, {})["isToggled"] = bool(rng.random() < 0.5)
+            return World(robot, room, placements, states=states, seed=int(rng.integers(2**31)), settle_s=0.05)
+        except (NoDraft, WorldError):
+            continue
+    raise WorldError(f"no arrangement of objects fits into {room}")
+
+
+def views_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
+    """Rows of one part of a `views` folder; the same for the same configuration, whoever computes it."""
+    numbers = config.indices(part)
+    for start in numbers[:: config.views_per_world]:
+        index = start // config.views_per_world + part
+        rng = rng_for("views", config.seed, start)
+        world = _random_world(config, index, rng)
+        assert world.robot is not None
+        free = navigation_map(world, world.robot.footprint_radius_m).free_positions()
+        renderer = Renderer(world, config.image_size, config.image_size)
+        before = draw_pose(world, free, rng)
+        for number in range(start, min(start + config.views_per_world, numbers.stop)):
+            pose = draw_pose(world, free, rng)
+            motion = lead_in(world, _nearby(before, pose, rng), pose, rng)
+            view = renderer.view("head", depth=True, segmentation=True)
+            yield view_row(world, view, motion, number)
+            before = pose
+
+
+def _nearby(before: Pose, pose: Pose, rng: np.random.Generator) -> Pose:
+    """Where the robot came from: the earlier posture, but at most a metre away and differing in some respects only."""
+    step = np.array([before.x_m - pose.x_m, before.y_m - pose.y_m])
+    step *= min(1.0, float(rng.uniform(0.0, 1.0)) / max(float(np.linalg.norm(step)), 1e-6))
+    walks, turns, bends, reaches = rng.random(4) < (0.5, 0.4, 0.5, 0.5)
+    return Pose(
+        pose.x_m + (float(step[0]) if walks else 0.0),
+        pose.y_m + (float(step[1]) if walks else 0.0),
+        pose.yaw_rad + (float(rng.uniform(-1.5, 1.5)) if turns else 0.0),
+        before.height_m if bends else pose.height_m,
+        before.joints if reaches else pose.joints,
+    )

@@ -1,0 +1,1 @@
+"""The privileged expert: a job planner over object states and a lookahead in the simulator."""

@@ -1,0 +1,338 @@
+"""What is left to do: from goals and object states to an ordered list of arm jobs.
+
+Pure functions over metadata, no physics: the expert (`sim.expert.expert`) asks here what comes next and decides itself where to
+stand. Order is canonical, so that demonstrations are regular: switches and doors that the goal asks for, then work with tools
+and liquids, then small objects (pick all that the hands can take, then put them down), then doors to close, then things that
+take two hands, then what has to stay in the hands at the end. A door that falls shut is held open by one hand while the other
+one reaches through it, and what would roll away under a tool is held by one hand while the other one works.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from data.records import ACTIONS, Action, ActionKind, Arm
+from sim.tasks.predicates import Predicate
+
+__all__ = ["Facts", "Job", "pending_leaves", "plan_jobs"]
+
+_NEGATION: Final = {"open": "closed", "closed": "open", "toggled_on": "toggled_off", "toggled_off": "toggled_on"}
+#: What a hand has to hold to bring a state about, and the action that does.
+_TOOL_WORK: Final = {"sliced": ("cutter", "Slice"), "clean": ("wiper", "Clean")}
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One arm action still to be done.
+
+    Attributes:
+        verb: name of an arm or two-arm action of the grammar.
+        target: the action's object, empty for actions without one.
+        arm: the arm that has to do it, None when any free arm may (or both do).
+        then: what the other arm does next from the same place, None when the robot may walk in between.
+    """
+
+    verb: str
+    target: str
+    arm: Arm | None = None
+    then: Job | None = None
+
+    def action(self, arm: Arm | None) -> Action:
+        """The grammar's action, done by `arm` (ignored for two-arm actions)."""
+        one = arm if ACTIONS[self.verb].kind is ActionKind.ARM else None
+        return Action(self.verb, arm=one, object_id=self.target or None)
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """The states that decide what comes next.
+
+    Attributes:
+        objects: AI2-THOR metadata by object id.
+        held: object in each hand, None for an empty one; a lifted object is in `lifted`, not here. Furniture is in a hand that
+            holds its door.
+        lifted: object in both hands.
+        two_handed: ids that need both hands.
+        homes: where each object stood at the start, to put strays back.
+        uncovered: ids that open but shut nothing away: a closed one is in nobody's way.
+        tools: ids by what they are good for, `cutter` and `wiper`.
+        unsteady: ids that roll or slide away under a tool.
+        outlets: ids that a liquid comes out of when they are switched on, and burners with the knob that heats them.
+        switches: switch by the furniture that it works on, where that is another object.
+        arms: arms that can be used.
+    """
+
+    objects: Mapping[str, Mapping[str, Any]]
+    held: Mapping[Arm, str | None]
+    lifted: str | None
+    two_handed: frozenset[str]
+    homes: Mapping[str, str]
+    uncovered: frozenset[str] = frozenset()
+    tools: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    unsteady: frozenset[str] = frozenset()
+    outlets: tuple[str, ...] = ()
+    switches: Mapping[str, str] = field(default_factory=dict)
+    arms: tuple[Arm, ...] = (Arm.RIGHT, Arm.LEFT)
+
+    def closed_carrier(self, object_id: str) -> str | None:
+        """The closed receptacle around an object, if any."""
+        for carrier in self.objects[object_id]["parentReceptacles"] or ():
+            if self.is_closed(carrier):
+                return carrier
+        return None
+
+    def is_closed(self, object_id: str) -> bool:
+        """Whether the object is closed and its contents are out of reach."""
+        entry = self.objects[object_id]
+        return bool(entry["openable"]) and not entry["isOpen"] and object_id not in self.uncovered
+
+    def falls_shut(self, object_id: str) -> bool:
+        """Whether its door or drawer shuts as soon as nothing holds it open."""
+        return bool(self.objects[object_id].get("selfClosing", False))
+
+    def free_arms(self) -> tuple[Arm, ...]:
+        """Empty hands, the right one first."""
+        return () if self.lifted else tuple(arm for arm in self.arms if self.held[arm] is None)
+
+    def arm_with(self, object_id: str) -> Arm | None:
+        """The arm that holds an object."""
+        return next((arm for arm, item in self.held.items() if item == object_id), None)
+
+    def in_place(self, object_id: str) -> bool:
+        """Whether a held object still rests where it was, as Hold leaves it, or is furniture."""
+        entry = self.objects[object_id]
+        return bool(entry["parentReceptacles"]) or not (entry["pickupable"] or entry["moveable"])
+
+
+def pending_leaves(goals: Sequence[Predicate], objects: Mapping[str, Mapping[str, Any]]) -> list[Predicate]:
+    """The leaf conditions that still have to be made true, in goal order.
+
+    Of an `or` the first operand is taken, of a `count` or an `exists` as many as are missing.
+
+    Raises:
+        ValueError: on a `not` that names no state to bring about.
+    """
+    metadata = {"objects": list(objects.values())}
+    leaves: list[Predicate] = []
+    for goal in goals:
+        if goal.holds(metadata):
+            continue
+        if goal.kind == "and":
+            leaves += pending_leaves(goal.of, objects)
+        elif goal.kind == "or":
+            leaves += pending_leaves(goal.of[:1], objects)
+        elif goal.kind in ("count", "exists"):
+            operands = goal.candidates(objects) if goal.kind == "exists" else goal.of
+            missing = goal.at_least - sum(operand.holds(metadata) for operand in operands)
+            leaves += pending_leaves([operand for operand in operands if not operand.holds(metadata)][:missing], objects)
+        elif goal.kind == "not":
+            operand = goal.of[0]
+            if operand.kind not in _NEGATION:
+                raise ValueError(f"no way to bring about not {operand.kind!r}; allowed: {', '.join(_NEGATION)}")
+            leaves.append(Predicate(_NEGATION[operand.kind], operand.object_id))  # type: ignore[arg-type]
+        else:
+            leaves.append(goal)
+    return leaves
+
+
+def plan_jobs(goals: Sequence[Predicate], facts: Facts) -> list[Job]:
+    """Jobs that can be done now; the first one has priority, the others may run beside it on the other arm.
+
+    Returns:
+        An empty list when all goals hold.
+    """
+    leaves = pending_leaves(goals, facts.objects)
+    if not leaves:
+        return []
+    if facts.lifted is not None:
+        return [_put_down_lifted(leaves, facts)]
+    through = _through_held_door(leaves, facts)
+    if through:
+        return through
+    moves = [leaf for leaf in leaves if leaf.kind in ("on", "in")]
+    heavy = [leaf for leaf in moves if leaf.object_id in facts.two_handed]
+    light = [leaf for leaf in moves if leaf.object_id not in facts.two_handed]
+    strays = _strays(goals, leaves, light, facts)
+    if strays:
+        return strays
+    work = _work_jobs(leaves, facts)
+    if work:
+        return work
+    free = bool(facts.free_arms())
+    jobs: list[Job] = []
+    if free:
+        jobs += [Job("ToggleOn", leaf.object_id) for leaf in leaves if leaf.kind == "toggled_on"]
+        jobs += [Job("ToggleOff", leaf.object_id) for leaf in leaves if leaf.kind == "toggled_off"]
+        jobs += [Job("Open", leaf.object_id) for leaf in leaves if leaf.kind == "open"]
+    jobs += _light_jobs(light, facts)
+    if free and not light:
+        jobs += [Job("Close", leaf.object_id) for leaf in leaves if leaf.kind == "closed"]
+    if jobs:
+        return _with_picks(jobs, leaves, facts)
+    for leaf in heavy:
+        if facts.is_closed(leaf.receptacle_id):
+            return [Job("Open", leaf.receptacle_id)]
+        return [Job("Lift", leaf.object_id)]
+    picks = _held_jobs(leaves, facts)
+    return (
+        picks
+        or [Job("Lift", leaf.object_id) for leaf in leaves if leaf.kind == "lifted"]
+        or [Job("ResetArm", "", facts.arms[0]) for leaf in leaves if leaf.kind == "cooked"]  # it takes time
+    )
+
+
+def _all_leaves(goals: Sequence[Predicate]) -> list[Predicate]:
+    return [leaf for goal in goals for leaf in (_all_leaves(goal.of) if goal.of else [goal])]
+
+
+def _strays(goals: Sequence[Predicate], leaves: Sequence[Predicate], light: Sequence[Predicate], facts: Facts) -> list[Job]:
+    """Putting away, or letting go of, what no goal wants in a hand."""
+    kept = {goal.object_id for goal in _all_leaves(goals) if goal.kind == "held"} | {leaf.object_id for leaf in light}
+    if any(leaf.kind == "filled" for leaf in leaves):  # the vessel, and what it may be filled from
+        kept |= {leaf.object_id for leaf in leaves if leaf.kind == "filled"}
+        kept |= {item for item in facts.held.values() if item is not None and facts.objects[item]["isFilledWithLiquid"]}
+    for leaf in leaves:
+        if leaf.kind in _TOOL_WORK:
+            kept |= {leaf.object_id, *facts.tools.get(_TOOL_WORK[leaf.kind][0], ())}
+    for arm, item in facts.held.items():
+        if item is None or item in kept:
+            continue
+        if facts.in_place(item):
+            return [Job("Release", "", arm)]
+        return _through_door(Job("Place", facts.homes[item], arm), facts)
+    return []
+
+
+def _through_held_door(leaves: Sequence[Predicate], facts: Facts) -> list[Job]:
+    """What is left to do through a door that a hand holds open; letting go of it when nothing is."""
+    for arm, door in facts.held.items():
+        if door is None or not facts.falls_shut(door):
+            continue
+        for leaf in leaves:
+            bearer = facts.arm_with(leaf.object_id)
+            if leaf.kind in ("on", "in") and leaf.receptacle_id == door and bearer is not None:
+                return [Job("Place", door, bearer)]
+            inside = door in (facts.objects[leaf.object_id]["parentReceptacles"] or ())
+            if leaf.kind in ("held", "on", "in") and leaf.receptacle_id != door and inside and facts.free_arms():
+                return [Job("Pick", leaf.object_id)]
+        return [Job("Release", "", arm)]
+    return []
+
+
+def _put_down_lifted(leaves: Sequence[Predicate], facts: Facts) -> Job:
+    for leaf in leaves:
+        if leaf.kind in ("on", "in") and leaf.object_id == facts.lifted:
+            return Job("PlaceBoth", leaf.receptacle_id)
+    home = facts.homes.get(facts.lifted or "")
+    open_places = (name for name, entry in facts.objects.items() if entry["receptacle"] and not entry["moveable"]
+                   and not entry["pickupable"] and not facts.is_closed(name))  # fmt: skip
+    return Job("PlaceBoth", home if home is not None else next(open_places))
+
+
+def _through_door(job: Job, facts: Facts) -> list[Job]:
+    """The job, or the opening of the receptacle that it needs first."""
+    door = job.target if job.verb == "Place" and facts.is_closed(job.target) else None
+    if job.verb == "Pick":
+        door = facts.closed_carrier(job.target)
+    if door is None or not facts.free_arms():
+        return [job]
+    return [Job("Open", door, then=job if facts.falls_shut(door) else None)]
+
+
+# ---- tools, liquids, heat
+
+
+def _work_jobs(leaves: Sequence[Predicate], facts: Facts) -> list[Job]:
+    """The next step towards the first state that takes a tool, a vessel or heat."""
+    for leaf in leaves:
+        if leaf.kind in _TOOL_WORK:
+            return _tool_jobs(leaf, facts)
+        if leaf.kind == "filled":
+            return _fill_jobs(leaf.object_id, facts)
+        if leaf.kind == "used_up" and facts.free_arms():
+            return [Job("UseUp", leaf.object_id)]
+        if leaf.kind == "cooked":
+            job = _heat_job(leaf.object_id, facts)
+            if job is not None:
+                return [job]
+    return []
+
+
+def _tool_jobs(leaf: Predicate, facts: Facts) -> list[Job]:
+    use, verb = _TOOL_WORK[leaf.kind]
+    tools = facts.tools.get(use, ())
+    arm = next((arm for arm, item in facts.held.items() if item in tools), None)
+    if arm is None:
+        return _through_door(Job("Pick", tools[0]), facts) if tools else []
+    work = Job(verb, leaf.object_id, arm)
+    if leaf.object_id in facts.unsteady and facts.arm_with(leaf.object_id) is None:
+        return [Job("Hold", leaf.object_id, arm.other, then=work)]
+    return [work]
+
+
+def _fill_jobs(vessel: str, facts: Facts) -> list[Job]:
+    """Filling a vessel: from another one that holds a liquid, else at an outlet."""
+    bearer = facts.arm_with(vessel)
+    full = [
+        name
+        for name, entry in facts.objects.items()
+        if name != vessel and entry["isFilledWithLiquid"] and entry["pickupable"] and name not in facts.two_handed
+    ]
+    if full and bearer is None:
+        arm = facts.arm_with(full[0])
+        return [Job("Pick", full[0])] if arm is None else [Job("Pour", vessel, arm)]
+    if not facts.outlets:
+        return []
+    if bearer is None:
+        return _through_door(Job("Pick", vessel), facts)
+    outlet = facts.outlets[0]
+    if not facts.objects[outlet]["isToggled"] and facts.free_arms():
+        return [Job("ToggleOn", outlet)]
+    return [Job("Fill", outlet, bearer)]
+
+
+def _heat_job(food: str, facts: Facts) -> Job | None:
+    """Closing and switching on what the food lies in or on; None while it is on no heat source, or when it is being heated."""
+    for place in facts.objects[food]["parentReceptacles"] or ():
+        if not facts.objects[place]["isHeatSource"] or facts.objects[food]["isPickedUp"]:
+            continue
+        if facts.objects[place]["openable"] and facts.objects[place]["isOpen"]:
+            return Job("Close", place)
+        if not facts.objects[place]["isToggled"]:
+            return Job("ToggleOn", facts.switches.get(place, place))
+    return None
+
+
+# ---- carrying
+
+
+def _light_jobs(light: Sequence[Predicate], facts: Facts) -> list[Job]:
+    """Carrying small objects: fill the hands first, but keep one free for a door that is still closed."""
+    arm_of = {item: arm for arm, item in facts.held.items() if item is not None}
+    waiting = [leaf for leaf in light if leaf.object_id not in arm_of]
+    in_hand = [leaf for leaf in light if leaf.object_id in arm_of]
+    door_ahead = any(facts.is_closed(leaf.receptacle_id) for leaf in in_hand)
+    if waiting and facts.free_arms() and not door_ahead:
+        closed = [leaf.receptacle_id for leaf in waiting if facts.is_closed(leaf.receptacle_id)]
+        ajar = [door for door in closed if not facts.falls_shut(door)]
+        if ajar and not in_hand and (len(waiting) > 1 or len(facts.arms) == 1):
+            return [Job("Open", ajar[0])]  # nothing is free for the door later
+        room = 1 if closed else len(facts.free_arms())
+        jobs = [job for leaf in waiting for job in _through_door(Job("Pick", leaf.object_id), facts)]
+        return list(dict.fromkeys(jobs))[:room]
+    places = [job for leaf in in_hand for job in _through_door(Job("Place", leaf.receptacle_id, arm_of[leaf.object_id]), facts)]
+    return list(dict.fromkeys(places))
+
+
+def _held_jobs(leaves: Sequence[Predicate], facts: Facts) -> list[Job]:
+    jobs = [job for leaf in leaves if leaf.kind == "held" for job in _through_door(Job("Pick", leaf.object_id), facts)]
+    return list(dict.fromkeys(jobs))
+
+
+def _with_picks(jobs: list[Job], leaves: Sequence[Predicate], facts: Facts) -> list[Job]:
+    """Adds picking up as a possible companion of a switch or a door, when both hands are free for it."""
+    if len(jobs) == 1 and len(facts.free_arms()) == 2 and jobs[0].verb in ("Open", "Close", "ToggleOn", "ToggleOff"):
+        return jobs + [job for job in _held_jobs(leaves, facts) if job.verb == "Pick"][:1]
+    return jobs

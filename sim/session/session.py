@@ -1,0 +1,365 @@
+"""One robot in one room with one task: reset, step, observe, judge, save and restore.
+
+A session is what planners are run against and what the Gymnasium environment and the AI2-THOR-style controller wrap. It owns
+the world, the trial's luck, what the robot has seen so far, the history and the running statistics. Everything that a later
+step depends on is part of `snapshot()`, so restoring and repeating gives bit-equal results.
+
+Paper: problem formulation (observation, dual-arm action, feedback), undo and redo of DualTHOR.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from data.records import Action, ActionKind, ActionOutcome, Arm, Feedback, HistoryItem, Observation, PlanStep
+from sim.robots.build_solver import robot_kit
+from sim.robots.spec import load_robot
+from sim.scene.objects import Placement
+from sim.session.contingency import Contingency, load_contingency
+from sim.session.observation import observe
+from sim.skills.body import Body, ready_posture
+from sim.skills.failures import SkillFailure
+from sim.skills.registry import assess_action, skills_for
+from sim.skills.runner import CONTROL_DT_S, run_skills
+from sim.world.snapshot import WorldSnapshot
+from sim.world.world import World
+
+__all__ = ["FreePlay", "Session", "SessionSnapshot", "SessionStats", "TaskLike"]
+
+
+class GoalLike(Protocol):
+    """A condition on the scene's metadata; `sim.tasks.predicates.Predicate` is one."""
+
+    def holds(self, metadata: Mapping[str, Any]) -> bool:
+        """Whether it is true."""
+        ...
+
+
+class StartLike(Protocol):
+    """Start pose of the robot; `sim.tasks.task.Start` has this shape."""
+
+    @property
+    def x_m(self) -> float: ...
+    @property
+    def y_m(self) -> float: ...
+    @property
+    def yaw_deg(self) -> float: ...
+    @property
+    def pelvis_height_m(self) -> Mapping[str, float]: ...
+
+
+class TaskLike(Protocol):
+    """What a session needs of a task; `sim.tasks.task.Task` has this shape."""
+
+    @property
+    def room(self) -> str: ...
+    @property
+    def instruction(self) -> str: ...
+    @property
+    def start(self) -> StartLike | None: ...
+    @property
+    def placements(self) -> Sequence[Placement] | None: ...
+    @property
+    def states(self) -> Mapping[str, Mapping[str, bool | float | str]]: ...
+    @property
+    def goals(self) -> Sequence[GoalLike]: ...
+    @property
+    def step_budget(self) -> int: ...
+    @property
+    def seed(self) -> int: ...
+
+
+@dataclass(frozen=True, slots=True)
+class FreePlay:
+    """A room without a goal, as it is by default.
+
+    Attributes:
+        room: room name.
+        instruction, start, placements, states, goals, step_budget, seed: as in `TaskLike`.
+    """
+
+    room: str
+    instruction: str = "Look around."
+    start: StartLike | None = None
+    placements: Sequence[Placement] | None = None
+    states: Mapping[str, Mapping[str, bool | float | str]] = field(default_factory=dict)
+    goals: tuple[GoalLike, ...] = ()
+    step_budget: int = 1_000_000
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class SessionStats:
+    """Running sums of an episode.
+
+    Attributes:
+        steps: plan steps taken.
+        struck: those of them that a contingency spoiled.
+        path_length_m: length of the base's path.
+        makespan_s: simulated seconds.
+        arm_steps: arm actions executed, a two-arm action counts twice.
+    """
+
+    steps: int = 0
+    struck: int = 0
+    path_length_m: float = 0.0
+    makespan_s: float = 0.0
+    arm_steps: int = 0
+
+    @property
+    def charged(self) -> int:
+        """Steps that count towards the budget: it bounds what is planned, not the luck, so struck ones do not."""
+        return self.steps - self.struck
+
+    @property
+    def arm_utilisation(self) -> float:
+        """Mean fraction of arm-steps in which an arm acted, in [0, 1]."""
+        return self.arm_steps / (2 * self.steps) if self.steps else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class SessionSnapshot:
+    """Everything that the future of a session depends on."""
+
+    world: WorldSnapshot
+    seen: tuple[str, ...]
+    history: tuple[HistoryItem, ...]
+    stats: SessionStats
+    ended: bool
+
+
+class Session:
+    """Runs tasks with one robot.
+
+    Args:
+        robot: robot name.
+        difficulty: easy, medium, hard or natural.
+        image_size: side of the planner's picture, pixels; 0 draws none.
+        contingency: name of the outcome distributions in `configs/contingency`.
+        all_known: whether actions may name any object, seen or not; not how planners are evaluated.
+
+    Attributes:
+        world, body, task, stats: of the running episode; only after `reset`.
+        watchers: called with the world and the text of the running step after every control tick; they must change nothing.
+    """
+
+    world: World
+    body: Body
+    task: TaskLike
+
+    def __init__(
+        self,
+        robot: str,
+        difficulty: str = "easy",
+        image_size: int = 112,
+        contingency: str = "default",
+        *,
+        all_known: bool = False,
+    ) -> None:
+        self.robot = load_robot(robot)
+        self._all_known = all_known
+        self.image_size = image_size
+        self._config = load_contingency(contingency)
+        self._luck = Contingency(self._config, difficulty, 0)
+        self.stats = SessionStats()
+        self.watchers: list[Callable[[World, str], None]] = []
+        self._seen: set[str] = set()
+        self._history: list[HistoryItem] = []
+        self._ended = False
+        self._opened = False
+        self._lucky = False
+
+    # ---- episode
+
+    def reset(self, task: TaskLike, seed: int) -> Observation:
+        """Starts a task.
+
+        Args:
+            task: what is to be done and where.
+            seed: key of the trial's luck; the scene itself follows from the task.
+        """
+        self.close()
+        joints: dict[str, float] = {}
+        for arm in Arm:
+            posture = ready_posture(robot_kit(self.robot), arm)
+            joints |= dict(zip(self.robot.arms[arm.value].joints, map(float, posture), strict=True))
+        start, height = None, None
+        if task.start is not None:
+            start = (task.start.x_m, task.start.y_m, float(np.deg2rad(task.start.yaw_deg)))
+            height = task.start.pelvis_height_m.get(self.robot.name)
+        if height is not None:
+            legs = robot_kit(self.robot).crouches.legs(height)
+            joints |= dict(zip(self.robot.leg_joints, map(float, legs), strict=True))
+        self.world = World(
+            self.robot,
+            task.room,
+            task.placements,
+            states=task.states,
+            start=start,
+            pelvis_height_m=height,
+            joint_positions=joints,
+            seed=task.seed,
+        )
+        self.body = Body(self.world)
+        self.task = task
+        self._luck = dataclasses.replace(self._luck, seed=seed)
+        self.stats = SessionStats()
+        self._seen, self._history, self._ended, self._opened = set(), [], False, True
+        return self.observation()
+
+    def step(self, step: PlanStep) -> tuple[Observation, Feedback]:
+        """Acts a plan step out in physics and looks around.
+
+        Raises:
+            RuntimeError: before `reset`, or after Done.
+        """
+        feedback = self.act(step)
+        return self.observation(), feedback
+
+    def act(self, step: PlanStep) -> Feedback:
+        """As `step`, without looking around afterwards; what came into view meanwhile stays unknown.
+
+        Raises:
+            RuntimeError: before `reset`, or after Done.
+        """
+        if not self._opened or self._ended:
+            raise RuntimeError("the episode is over: reset first" if self._opened else "no episode: reset first")
+        if step.actions[0].spec.kind is ActionKind.EPISODE:
+            self._ended = True
+            outcomes: tuple[ActionOutcome, ...] = tuple(ActionOutcome(action, True) for action in step.actions)
+            feedback = Feedback(outcomes, 0.0)
+        else:
+            feedback = self._run(step)
+        arms = sum(2 if a.spec.kind is ActionKind.TWO_ARM else int(a.spec.kind is ActionKind.ARM) for a in step.actions)
+        self.stats = dataclasses.replace(
+            self.stats,
+            steps=self.stats.steps + 1,
+            struck=self.stats.struck + feedback.struck,
+            makespan_s=self.stats.makespan_s + feedback.duration_s,
+            arm_steps=self.stats.arm_steps + arms,
+        )
+        self._history.append(HistoryItem(step.to_text(), feedback.to_text()))
+        return feedback
+
+    def _run(self, step: PlanStep) -> Feedback:
+        started = self.world.time_s
+        skills = skills_for(self.body, step, frozenset(self.known_objects), self.draw)
+        place = self.body.base().position
+        path, text = 0.0, step.to_text()
+
+        def advance() -> None:
+            nonlocal place, path
+            self.world.advance(CONTROL_DT_S)
+            now = self.body.base().position
+            path += float(np.linalg.norm(now - place))
+            place = now
+            for watch in self.watchers:
+                watch(self.world, text)
+
+        outcomes = run_skills(skills, advance)
+        if path > 0.01:  # less is the servos' tremor
+            self.stats = dataclasses.replace(self.stats, path_length_m=self.stats.path_length_m + path)
+        return Feedback(outcomes, self.world.time_s - started)
+
+    @contextmanager
+    def imagining(self) -> Iterator[None]:
+        """Steps taken inside are undone at its end, nobody watches them, and no contingency strikes; for the expert."""
+        before, watchers = self.snapshot(), self.watchers
+        self.watchers, self._lucky = [], True
+        try:
+            yield
+        finally:
+            self.restore(before)
+            self.watchers, self._lucky = watchers, False
+
+    def draw(self, action: Action) -> str:
+        """The contingency of an action at the present step."""
+        if self._lucky:
+            return "success"
+        object_id = self.body.subject(action)
+        thing = self.world.objects[object_id]
+        state = {name: getattr(thing.state, name) for name in ("isFilledWithLiquid", "isToggled", "isDirty", "isBroken")}
+        return self._luck.draw(self.stats.steps, action.name, object_id, thing.type.name, state)
+
+    def assess(self, action: Action) -> SkillFailure | None:
+        """Why an action would be refused right now, None when it would be tried. Moves nothing; for the privileged expert."""
+        return assess_action(self.body, action, frozenset(self.known_objects))
+
+    def teleport(self, x_m: float, y_m: float, yaw_rad: float, pelvis_height_m: float | None = None) -> None:
+        """Puts the base somewhere at once, and what the hands hold with it; the pelvis height stays when it is None.
+
+        Privileged; not an action of the grammar, and no part of any planner's episode.
+        """
+        self.world.put_base(x_m, y_m, yaw_rad, pelvis_height_m)
+
+    # ---- views
+
+    def observation(self) -> Observation:
+        """What the robot sees now; objects in view become known."""
+        seen = observe(
+            self.world,
+            self.task.instruction,
+            self.image_size,
+            self.known_objects,
+            self._history,
+            self.stats.charged,
+            self.task.step_budget,
+        )
+        self._seen.update(seen.visible_objects)
+        return seen
+
+    @property
+    def known_objects(self) -> tuple[str, ...]:
+        """Ids that actions may name: fixed furniture, and everything seen so far in the episode."""
+        known = self.world.objects.items()
+        return tuple(name for name, thing in known if self._all_known or not thing.movable or name in self._seen)
+
+    def goal_status(self) -> tuple[bool, ...]:
+        """Whether each of the task's goals holds."""
+        metadata = self.world.metadata()
+        return tuple(goal.holds(metadata) for goal in self.task.goals)
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether there are goals and all of them hold."""
+        return bool(self.task.goals) and all(self.goal_status())
+
+    @property
+    def ended(self) -> bool:
+        """Whether the planner has said Done."""
+        return self._ended
+
+    @property
+    def finished(self) -> bool:
+        """Whether the episode is over: Done, all goals hold, or the step budget is used up."""
+        return self._ended or self.stats.charged >= self.task.step_budget or self.succeeded
+
+    @property
+    def history(self) -> tuple[HistoryItem, ...]:
+        """Steps so far with their feedback."""
+        return tuple(self._history)
+
+    # ---- snapshots
+
+    def snapshot(self) -> SessionSnapshot:
+        """An exact copy of the episode's state."""
+        return SessionSnapshot(self.world.save(), tuple(sorted(self._seen)), tuple(self._history), self.stats, self._ended)
+
+    def restore(self, snapshot: SessionSnapshot) -> None:
+        """Returns to a snapshot of the same episode."""
+        self.world.restore(snapshot.world)
+        self._seen = set(snapshot.seen)
+        self._history = list(snapshot.history)
+        self.stats = snapshot.stats
+        self._ended = snapshot.ended
+
+    def close(self) -> None:
+        """Frees the drawing contexts of the running episode."""
+        if self._opened:
+            self.world.close()

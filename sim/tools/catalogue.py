@@ -1,0 +1,165 @@
+"""Lists types, rooms, robots, actions, failure codes and cameras: `python -m sim.scene.catalogue [--json]`.
+
+The user's own assets (`configs.assets`) are included. The JSON has the same entries with every field, and counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from configs.validate import ConfigError
+from data.records import ACTIONS
+from sim.interfaces.aliases import ALIASES
+from sim.robots.spec import available_robots, load_robot
+from sim.scene.catalogue import load_catalogue
+from sim.scene.rooms import load_room, room_names
+from sim.session.contingency import DIFFICULTIES, OUTCOMES
+from sim.skills.failures import FAILURES
+from sim.world.rendering import CAMERAS
+
+__all__ = ["inventory", "main"]
+
+Row = dict[str, Any]
+
+
+def inventory() -> dict[str, Any]:
+    """Everything that commands and configurations may name: a list of rows per kind, and `counts`."""
+    parts: dict[str, list[Row]] = {
+        "types": _types(),
+        "rooms": _rooms(),
+        "robots": _robots(),
+        "actions": _actions(),
+        "failure_codes": [
+            {
+                "code": code.value,
+                "category": "of the action" if spec.category is None else spec.category.value,
+                "meaning": spec.meaning,
+                "margins": list(spec.margins),
+            }
+            for code, spec in FAILURES.items()
+        ],
+        "cameras": [{"name": name} for name in CAMERAS],
+        "difficulties": [{"name": name} for name in DIFFICULTIES],
+        "contingencies": [{"outcome": name} for name in OUTCOMES],
+    }
+    return {**parts, "counts": {name: len(rows) for name, rows in parts.items()}}
+
+
+def _types() -> list[Row]:
+    return [
+        {
+            "name": kind.name,
+            "rooms": list(kind.rooms),
+            "size_m": list(kind.size),
+            "mass_kg": kind.mass,
+            "properties": sorted(kind.properties),
+            "moving": [moving.name for moving in kind.moving],
+        }
+        for kind in load_catalogue().types.values()
+    ]
+
+
+def _rooms() -> list[Row]:
+    rows: list[Row] = []
+    for name in room_names():
+        room = load_room(name)
+        x0, y0, x1, y1 = room.bounds
+        rows.append(
+            {
+                "name": name,
+                "category": room.category,
+                "size_m": [round(x1 - x0, 3), round(y1 - y0, 3)],
+                "furniture": [item.id for item in room.furniture],
+                "objects": {item.id: item.receptacle for item in room.objects},
+            }
+        )
+    return rows
+
+
+def _robots() -> list[Row]:
+    rows: list[Row] = []
+    for name in available_robots():
+        spec = load_robot(name)
+        rows.append(
+            {
+                "name": name,
+                "joints": len(spec.joints),
+                "arm_joints": len(spec.arms["left"].joints),
+                "hand_joints": len(spec.arms["left"].hand_joints),
+                "pelvis_height_m": list(spec.pelvis_height_range_m),
+                "max_load_kg": spec.arms["left"].max_load_kg,
+                "two_arm_max_load_kg": spec.two_arm_max_load_kg,
+                "solver": spec.solver,
+            }
+        )
+    return rows
+
+
+def _actions() -> list[Row]:
+    aliases: dict[str, list[str]] = {}
+    for alias, name in ALIASES.items():
+        if alias != name.lower():
+            aliases.setdefault(name, []).append(alias)
+    return [
+        {
+            "name": spec.name,
+            "kind": spec.kind.value,
+            "takes_object": spec.takes_object,
+            "amount": None
+            if spec.amount_unit is None
+            else {"unit": spec.amount_unit, "range": list(spec.amount_range), "default": spec.amount_default},
+            "aliases": aliases.get(spec.name, []),
+        }
+        for spec in ACTIONS.values()
+    ]
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key}: {_cell(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(map(_cell, value)) or "–"
+    return "–" if value is None else "yes" if value is True else "no" if value is False else str(value)
+
+
+def _print(parts: Mapping[str, Any], console: Console) -> None:
+    for name, count in parts["counts"].items():
+        rows: list[Row] = parts[name]
+        if len(rows) and len(rows[0]) == 1:
+            console.print(f"\n{name} ({count}): {', '.join(str(*row.values()) for row in rows)}")
+            continue
+        table = Table(box=SIMPLE_HEAD, title=f"{name} ({count})", title_justify="left")
+        for column in rows[0]:
+            table.add_column(column.replace("_", " "), overflow="fold")
+        for row in rows:
+            table.add_row(*map(_cell, row.values()))
+        console.print(table)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Prints the inventory; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m sim.scene.catalogue", description=__doc__)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    wanted = parser.parse_args(arguments)
+    try:
+        parts = inventory()
+    except ConfigError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    if wanted.json:
+        sys.stdout.write(json.dumps(parts, indent=1) + "\n")
+    else:
+        _print(parts, Console(width=None if sys.stdout.isatty() else 160))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The running world: physics and time, and the owners of what changes in it."""

@@ -1,0 +1,153 @@
+"""AI2-THOR-style metadata of a world: one record per object, and the robot's.
+
+Paper: the scene state that DualTHOR returns. Frames: MuJoCo's (z up, metres); AI2-THOR's y-up frame is not used. Key names are
+AI2-THOR's, plus `heldBy` (arms that hold the object), `center`, `temperatureCelsius`, and DualTHOR's `isMoveable`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sim.world import liquids
+from sim.world.placement import box_in_world
+
+if TYPE_CHECKING:
+    from sim.scene.objects import ObjectInstance
+    from sim.world.world import World
+
+__all__ = ["object_metadata", "temperature_name", "world_metadata"]
+
+
+#: A pelvis that is lower than standing by more than this is crouching, metres.
+_STANDING_M: Final = 0.05
+
+
+def temperature_name(celsius: float) -> str:
+    """AI2-THOR's class of a temperature: Cold below 12 °C, Hot above 45 °C, RoomTemp between."""
+    if celsius < 12.0:
+        return "Cold"
+    return "Hot" if celsius > 45.0 else "RoomTemp"
+
+
+def object_metadata(world: World, thing: ObjectInstance, parents: tuple[str, ...], contents: tuple[str, ...]) -> dict[str, Any]:
+    """One object's record."""
+    kind, state = thing.type, thing.state
+    low, high = box_in_world(world.data, thing)
+    position = world.data.xpos[thing.body_id]
+    center = (low + high) / 2.0
+    entry: dict[str, Any] = {
+        "objectId": thing.object_id,
+        "name": thing.object_id,
+        "objectType": kind.name,
+        "position": _xyz(position),
+        "center": _xyz(center),
+        "rotation": _euler(world, thing),
+        "distance": world.distance_to(thing.object_id),
+        "receptacle": kind.receptacle,
+        "toggleable": kind.toggleable,
+        "isToggled": state.isToggled,
+        "breakable": kind.has("breakable"),
+        "isBroken": state.isBroken,
+        "canFillWithLiquid": kind.fillable,
+        "isFilledWithLiquid": state.isFilledWithLiquid,
+        "fillLiquid": state.fillLiquid or None,
+        "fillLitres": state.fillLitres,
+        "dirtyable": kind.has("dirtyable"),
+        "isDirty": state.isDirty,
+        "canBeUsedUp": kind.has("used_up"),
+        "isUsedUp": state.isUsedUp,
+        "cookable": kind.has("cookable"),
+        "isCooked": state.isCooked,
+        "sliceable": kind.has("sliceable"),
+        "isSliced": state.isSliced,
+        "openable": kind.openable,
+        "isOpen": thing.is_open if kind.openable else False,
+        "openness": thing.openness,
+        "selfClosing": thing.self_closing,
+        "pickupable": kind.pickupable,
+        "isPickedUp": bool(thing.held_by),
+        "heldBy": list(thing.held_by),
+        "moveable": thing.movable and not kind.pickupable,
+        "isMoveable": thing.movable,
+        "isMoving": world.speed_of(thing.object_id) > 0.02,
+        "isHeatSource": kind.has("heat_source"),
+        "isColdSource": kind.has("cold_source"),
+        "temperature": temperature_name(state.temperature),
+        "temperatureCelsius": state.temperature,
+        "mass": world.total_mass_kg(thing.object_id) if thing.movable else 0.0,
+        "salientMaterials": list(kind.materials),
+        "parentReceptacles": list(parents),
+        "receptacleObjectIds": list(contents),
+        "axisAlignedBoundingBox": {"center": _xyz(center), "size": _xyz(high - low)},
+        "objectOrientedBoundingBox": {"cornerPoints": _corners(world, thing)},
+    }
+    return entry
+
+
+def world_metadata(world: World) -> dict[str, Any]:
+    """The whole scene's record: `objects`, `agent`, `sceneName`, `sceneBounds`, `inventoryObjects`."""
+    parents = world.all_parents()
+    contents: dict[str, list[str]] = {}
+    for name, above in parents.items():
+        for parent in above:
+            contents.setdefault(parent, []).append(name)
+    objects = [
+        object_metadata(world, thing, parents.get(name, ()), tuple(contents.get(name, ())))
+        for name, thing in world.objects.items()
+    ]
+    x0, y0, x1, y1 = world.room.bounds
+    record: dict[str, Any] = {
+        "objects": objects,
+        "sceneName": world.room.name,
+        "sceneBounds": {"center": _xyz([(x0 + x1) / 2, (y0 + y1) / 2, 1.3]), "size": _xyz([x1 - x0, y1 - y0, 2.6])},
+        "inventoryObjects": [
+            {"objectId": thing.object_id, "objectType": thing.type.name, "arms": list(thing.held_by)}
+            for thing in world.objects.values()
+            if thing.held_by
+        ],
+        "spills": liquids.facts(world),
+        "time": world.time_s,
+    }
+    if world.robot is not None:
+        pose = world.base_pose
+        record["agent"] = {
+            "name": world.robot.name,
+            "position": _xyz(pose[:3]),
+            "rotation": {"x": 0.0, "y": 0.0, "z": float(np.degrees(pose[3]))},
+            "pelvisHeight": float(pose[2]),
+            "isStanding": bool(pose[2] > world.robot.standing_pelvis_height_m - _STANDING_M),
+            "cameraHorizon": _horizon(world),
+            "jointAngles": world.joint_positions(),
+            "handOpening": {"left": world.hand_opening("left"), "right": world.hand_opening("right")},
+        }
+    return record
+
+
+def _horizon(world: World) -> float:
+    """Degrees by which the head camera looks below the horizon."""
+    assert world.robot is not None
+    camera = int(world.model.camera(world.robot.head_camera).id)
+    return float(np.degrees(np.arcsin(np.clip(world.data.cam_xmat[camera].reshape(3, 3)[2, 2], -1.0, 1.0))))
+
+
+def _xyz(values: Any) -> dict[str, float]:
+    return {"x": float(values[0]), "y": float(values[1]), "z": float(values[2])}
+
+
+def _corners(world: World, thing: ObjectInstance) -> list[list[float]]:
+    """Eight corners of the box in the object's own axes, world frame, metres."""
+    ends = (thing.local_min, thing.local_max)
+    local = np.array([[ends[i][0], ends[j][1], ends[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    rotation = world.data.xmat[thing.body_id].reshape(3, 3)
+    return (local @ rotation.T + world.data.xpos[thing.body_id]).tolist()
+
+
+def _euler(world: World, thing: ObjectInstance) -> dict[str, float]:
+    """Roll, pitch, yaw in degrees (rotations about x, y, z, in that order, in the world)."""
+    m = world.data.xmat[thing.body_id].reshape(3, 3)
+    roll = np.degrees(np.arctan2(m[2, 1], m[2, 2]))
+    pitch = np.degrees(np.arcsin(np.clip(-m[2, 0], -1.0, 1.0)))
+    yaw = np.degrees(np.arctan2(m[1, 0], m[0, 0]))
+    return {"x": float(roll), "y": float(pitch), "z": float(yaw)}

@@ -1,0 +1,183 @@
+"""Where objects rest and where there is room for one: surfaces of receptacles, free spots, containment.
+
+Pure geometry on the current poses. World frame in and out, metres. Paper: receptacles and `parentReceptacles` of DualTHOR.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.scene.catalogue import ObjectType
+from sim.scene.objects import ObjectInstance, Surface
+
+__all__ = ["OVERHANG_SHARE", "REACH_BAND_M", "box_in_world", "find_free_spot", "fits_on", "resting_on"]
+
+#: Depth from a receptacle's reachable edge within which objects are put.
+REACH_BAND_M: Final = 0.35
+#: Share of an object's narrow half that has to be on the surface: a wide load may stand over the edge by the rest.
+OVERHANG_SHARE: Final = 0.6
+_GRID_M: Final = 0.02
+_SMALL_M: Final = 0.15
+
+
+def box_in_world(data: mujoco.MjData, thing: ObjectInstance) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Axis-aligned bounding box (minimum, maximum) of an object with its doors closed, world frame."""
+    rotation = data.xmat[thing.body_id].reshape(3, 3)
+    center = data.xpos[thing.body_id] + rotation @ ((thing.local_min + thing.local_max) / 2.0)
+    half = np.abs(rotation) @ ((thing.local_max - thing.local_min) / 2.0)
+    return center - half, center + half
+
+
+def fits_on(kind: ObjectType, place: ObjectType) -> bool:
+    """Whether an object can stand on a surface of a type, in any orientation, with its whole footprint."""
+    radius, height = float(np.hypot(kind.size[0], kind.size[1])) / 2.0, kind.size[2]
+    surfaces = [*place.surfaces, *(surface for moving in place.moving for surface in moving.surfaces)]
+    return any(min(s.rect[2], s.rect[3]) / 2.0 >= radius + 0.01 and (s.clearance >= height or not s.inside) for s in surfaces)
+
+
+def _is_hollow(thing: ObjectInstance) -> bool:
+    return any(part.wall_m > 0.0 for part in thing.type.parts)
+
+
+def _to_world(data: mujoco.MjData, surface: Surface, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3) points of the type's frame in the world."""
+    return data.xpos[surface.body_id] + (points - surface.origin) @ data.xmat[surface.body_id].reshape(3, 3).T
+
+
+def _to_surface(data: mujoco.MjData, surface: Surface, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) world point in the type's frame of the body that carries the surface."""
+    return data.xmat[surface.body_id].reshape(3, 3).T @ (point - data.xpos[surface.body_id]) + surface.origin
+
+
+def find_free_spot(
+    data: mujoco.MjData,
+    objects: Mapping[str, ObjectInstance],
+    receptacle: ObjectInstance,
+    radius_m: float,
+    *,
+    height_m: float = 0.1,
+    near: NDArray[np.float64] | None = None,
+    rng: np.random.Generator | None = None,
+    gap_m: float = 0.03,
+    ignore: Iterable[str] = (),
+    band_m: float = REACH_BAND_M,
+) -> NDArray[np.float64] | None:
+    """A point on a receptacle's surfaces where an object of that footprint can be put.
+
+    Args:
+        data: current poses.
+        objects: everything in the scene; obstacles are all objects but the receptacle and `ignore`.
+        receptacle: where to put it; surfaces behind a closed door are skipped.
+        radius_m: radius of the footprint.
+        height_m: height of the object, must fit below the surface's clearance.
+        near: (2,) or (3,) world point; the nearest free spot is taken. Without it, `rng` draws one; without both, the spot
+            nearest to the middle of the reachable edge is taken.
+        rng: random stream.
+        gap_m: free distance to other objects.
+        ignore: ids that do not block (the object itself).
+        band_m: how far from the reachable edge a spot may be.
+
+    Returns:
+        (3,) world point on the surface, or None when there is no room.
+    """
+    skip = {receptacle.object_id, *ignore}
+    boxes = [box_in_world(data, thing) for name, thing in objects.items() if name not in skip]
+    found: list[NDArray[np.float64]] = []
+    for surface in receptacle.surfaces:
+        spec = surface.spec
+        if (spec.inside and not receptacle.is_open) or height_m > spec.clearance + (0.3 if _is_hollow(receptacle) else 10.0):
+            continue
+        if spec.inside and height_m > spec.clearance:
+            continue
+        points = _candidates(receptacle, surface, radius_m, band_m)
+        if not len(points):
+            continue
+        world = _to_world(data, surface, points)
+        free = np.ones(len(world), dtype=bool)
+        for low, high in boxes:
+            if high[2] < world[0, 2] - 0.005 or low[2] > world[0, 2] + height_m:
+                continue
+            # what carries the receptacle itself does not block: its top is below the surface
+            if high[2] <= world[0, 2] + 0.004:
+                continue
+            outside = np.maximum(np.maximum(low[:2] - world[:, :2], world[:, :2] - high[:2]), 0.0)
+            free &= np.hypot(outside[:, 0], outside[:, 1]) >= radius_m + gap_m
+        if free.any():
+            found.append(world[free])
+            if spec.inside and near is None:
+                break  # the first shelf with room; the order in the catalogue is the order of comfort
+    if not found:
+        return None
+    spots = np.concatenate(found)
+    if near is not None:
+        return spots[int(np.argmin(np.linalg.norm(spots[:, : len(near)] - near, axis=1)))]
+    if rng is not None:
+        return spots[int(rng.integers(len(spots)))]
+    middle = spots.mean(axis=0)
+    return spots[int(np.argmin(np.linalg.norm(spots - middle, axis=1)))]
+
+
+def _candidates(receptacle: ObjectInstance, surface: Surface, radius_m: float, band_m: float) -> NDArray[np.float64]:
+    """(N, 3) grid points of the type's frame on which a footprint of that radius fits, within the reachable band."""
+    cx, cy, sx, sy = surface.spec.rect
+    halves = []
+    for half in (sx / 2.0, sy / 2.0):
+        if radius_m <= half:
+            halves.append(half - radius_m)
+        elif not _is_hollow(receptacle) and half < _SMALL_M:
+            halves.append(0.0)  # a plate or burner carries what is wider than itself
+        else:
+            return np.zeros((0, 3))
+    xs, ys = (np.arange(-np.floor(h / _GRID_M), np.floor(h / _GRID_M) + 1) * _GRID_M for h in halves)
+    grid = np.stack(np.meshgrid(cx + xs, cy + ys), axis=-1).reshape(-1, 2)
+    low, high = receptacle.local_min, receptacle.local_max
+    if surface.spec.all_sides:
+        edge = np.min([grid[:, 0] - low[0], high[0] - grid[:, 0], grid[:, 1] - low[1], high[1] - grid[:, 1]], axis=0)
+    else:
+        edge = grid[:, 1] - low[1]
+    grid = grid[edge <= max(band_m, radius_m + 0.02)]
+    return np.column_stack([grid, np.full(len(grid), surface.spec.z)])
+
+
+def resting_on(data: mujoco.MjData, objects: Mapping[str, ObjectInstance]) -> dict[str, str]:
+    """Direct carrier of every movable object that rests on or in a surface.
+
+    An object rests on a surface when its middle is above the rectangle and its lowest point is at the surface (3 cm, or 6 mm
+    while a hand holds it), or, for hollow receptacles, below the rim. The highest such surface wins, so an apple in a bowl on a
+    table belongs to the bowl.
+    """
+    carriers: dict[str, str] = {}
+    surfaces = [(thing, surface) for thing in objects.values() for surface in thing.surfaces]
+    for name, thing in objects.items():
+        if not thing.movable:
+            continue
+        low, high = box_in_world(data, thing)
+        bottom = np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])
+        best = -np.inf
+        for receptacle, surface in surfaces:
+            if receptacle is thing:
+                continue
+            if (
+                abs(data.xpos[receptacle.body_id, 0] - bottom[0]) > 1.6
+                or abs(data.xpos[receptacle.body_id, 1] - bottom[1]) > 1.6
+            ):
+                continue
+            x, y, z = _to_surface(data, surface, bottom)
+            cx, cy, sx, sy = surface.spec.rect
+            margin = 0.02 if _is_hollow(receptacle) else 0.05
+            if abs(x - cx) > sx / 2.0 + margin or abs(y - cy) > sy / 2.0 + margin:
+                continue
+            heap = _is_hollow(receptacle) and (receptacle.type.lidded or not surface.spec.inside)
+            reach = 0.6 * surface.spec.clearance if heap else 0.03
+            if thing.held_by:
+                reach = 0.006
+            level = float(data.xpos[surface.body_id, 2] - surface.origin[2] + surface.spec.z)
+            if -0.02 <= z - surface.spec.z <= reach and level > best:
+                best = level
+                carriers[name] = receptacle.object_id
+    return carriers

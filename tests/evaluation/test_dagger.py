@@ -1,0 +1,98 @@
+"""Corrections: shards of the demonstrations' kind, the same after an interruption."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from configs.schema.collect import CollectConfig
+from data.records import Observation, PlanStep
+from data.shards import ShardReader
+from proprio_mllm.evaluation import corrections
+from proprio_mllm.evaluation.dagger import collect_corrections
+from proprio_mllm.training.rollouts import CorrectionRequest
+
+
+@pytest.fixture
+def request_(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CorrectionRequest:
+    def student(observation: Observation) -> PlanStep | None:
+        return PlanStep.parse(f"GoTo({observation.known_objects[-1]})")
+
+    monkeypatch.setattr(corrections, "_student", lambda model: student)
+    monkeypatch.setattr(corrections, "_PER_PART", {"demos": 2, "exercises": 2})
+    return CorrectionRequest(tmp_path / "model", tmp_path / "corrections", "demos", 4, 0, 0.5, 56, "hash")
+
+
+def test_an_interrupted_run_continues_to_the_same_rows(
+    request_: CorrectionRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = CorrectionRequest(request_.model, tmp_path / "whole", "demos", 4, 0, 0.5, 56, "hash")
+    collect_corrections(whole, workers=1)
+    part, calls = corrections._part, []
+
+    def dies(config, number, model):
+        calls.append(number)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return part(config, number, model)
+
+    monkeypatch.setattr(corrections, "_part", dies)
+    with pytest.raises(KeyboardInterrupt):
+        collect_corrections(request_, workers=1)
+    collect_corrections(request_, workers=1)
+    assert calls == [0, 1, 1]
+    collect_corrections(request_, workers=1)
+    assert len(calls) == 3
+    one, other = ShardReader(whole.folder, "demos"), ShardReader(request_.folder, "demos")
+    assert len(one) > 0
+    assert one.column("target") == other.column("target")
+    assert one.column("image") == other.column("image")
+    assert {"h1"} <= set(one.column("robot")) <= {"h1", "x1"}
+    assert one.manifest.metadata["expert_share"] == 0.5
+
+
+@pytest.fixture
+def in_words(request_: CorrectionRequest, monkeypatch: pytest.MonkeyPatch) -> CorrectionRequest:
+    def reader(moments: Sequence[Mapping[str, Any]]) -> list[PlanStep | None]:
+        return [None if moment["step"] % 3 == 2 else PlanStep.parse(f"Pick(left, {moment['known'][-1]})") for moment in moments]
+
+    monkeypatch.setattr(corrections, "student_in_words", lambda model: reader)
+    return dataclasses.replace(request_, kind="exercises", episodes=6)
+
+
+def test_corrections_in_words_are_exercises(in_words: CorrectionRequest) -> None:
+    collect_corrections(in_words, workers=1)
+    reader = ShardReader(in_words.folder, "exercises")
+    rows = [reader[i] for i in range(len(reader))]
+    logs = [item["step"] for row in rows for item in row["history"]]
+    assert any(step.startswith("Pick(left, ") for step in logs)
+    assert all(PlanStep.parse(row["target"]).to_text() == row["target"] for row in rows)
+    # what the student does again after a refusal, the expert does
+    for row in rows:
+        for before, after in pairwise(row["history"]):
+            assert before["feedback"].endswith(" ok") or before["step"] != after["step"] or after["step"] == row["target"]
+
+
+def test_training_keeps_its_threads(in_words: CorrectionRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    threads, seen = torch.get_num_threads(), list[int]()
+    asked = corrections._part
+    monkeypatch.setattr(corrections, "_part", lambda *job: (seen.append(torch.get_num_threads()), asked(*job))[1])
+    try:
+        torch.set_num_threads(2)
+        collect_corrections(in_words, workers=1)
+        assert (set(seen), torch.get_num_threads()) == ({1}, 2)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_the_expert_alone_solves_episodes_in_words(in_words: CorrectionRequest) -> None:
+    config = CollectConfig("exercises", "unused", 6, part_size=6, noise=1.0)
+    rows = corrections._part(config, 0, "unused")
+    assert rows == corrections._part(config, 0, "unused")
+    assert not [item for row in rows for item in row["history"] if item["feedback"].endswith(("HandOccupied", "HandEmpty"))]

@@ -1,0 +1,149 @@
+"""Collection: the same bytes for the same configuration, complete rows, resumption, refused arguments."""
+
+import json
+
+import numpy as np
+import pytest
+
+from configs.arguments import read_arguments
+from configs.schema.collect import CollectConfig
+from configs.validate import ConfigError
+from data.motion import N_FEATURES
+from data.records import Action, Arm, PlanStep
+from data.shards import ShardReader, decode_depth, decode_png, decode_segmentation
+from sim.collection.collect import collect, main, parts_of, rows_of_part
+from sim.collection.demonstrations import perturbed, run_correction, run_episode
+from sim.collection.view_sampling import type_names
+
+VIEWS = CollectConfig("views", "unused", 6, part_size=3, views_per_world=3, image_size=56)
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("views")
+    config = CollectConfig("views", str(folder), 6, part_size=3, views_per_world=3, image_size=56)
+    collect(config)
+    return ShardReader(folder, "views")
+
+
+def test_views_are_complete(views):
+    assert len(views) == 6
+    names = views.manifest.metadata["type_names"]
+    assert names == list(type_names())
+    for row in views:
+        image = decode_png(row["image"])
+        depth = decode_depth(row["depth"], row["height"], row["width"])
+        labels = decode_segmentation(row["segmentation"], row["height"], row["width"])
+        assert image.shape == (56, 56, 3)
+        assert np.isfinite(depth).all()
+        assert (depth > 0.0).all()
+        assert len(row["motion"]) == 64 * N_FEATURES
+        assert np.isfinite(row["motion"]).all()
+        shown = {names[index] for index in np.unique(labels[labels >= 0])}
+        assert {item["type"] for item in json.loads(row["objects"])} == shown
+
+
+def test_depth_agrees_with_what_is_seen(views):
+    """A visible object's centre, projected into the view, is at a depth near the pixels that show it."""
+    checked = 0
+    for row in views:
+        depth = decode_depth(row["depth"], row["height"], row["width"])
+        pelvis_in_camera = np.linalg.inv(np.reshape(row["camera_in_pelvis"], (4, 4)))
+        for item in json.loads(row["objects"]):
+            x0, y0, x1, y1 = item["bbox"]
+            in_camera = pelvis_in_camera @ np.array([*item["center_in_pelvis"], 1.0])
+            if item["pixels"] < 30 or in_camera[2] < 0.4:
+                continue
+            nearest = float(depth[y0:y1, x0:x1].min())
+            assert nearest < in_camera[2] + 1.5
+            checked += 1
+    assert checked > 3
+
+
+def test_parts_depend_on_the_configuration_only():
+    first, again = rows_of_part(VIEWS, 1), rows_of_part(VIEWS, 1)
+    assert [row["image"] for row in first] == [row["image"] for row in again]
+    assert [row["objects"] for row in first] == [row["objects"] for row in again]
+    assert parts_of(VIEWS) == 2
+
+
+def test_an_interrupted_run_is_continued(views, tmp_path):
+    config = CollectConfig("views", str(tmp_path), 6, part_size=3, views_per_world=3, image_size=56)
+    collect(config)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    manifest["parts"].pop("1")
+    manifest["complete"] = False
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    seen = []
+    collect(config, lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 2), (2, 2)]
+    assert [row["image"] for row in ShardReader(tmp_path, "views")] == [row["image"] for row in views]
+
+
+def test_an_episode_has_one_row_per_step_with_the_experts_choice():
+    config = CollectConfig("demos", "unused", 4, image_size=56, noise=0.5, medium_share=0.0, rooms=("kitchen_1",))
+    episode = run_episode(config, 1)
+    again = run_episode(config, 1)
+    assert [row["target"] for row in episode.rows] == [row["target"] for row in again.rows]
+    assert episode.rows
+    for number, row in enumerate(episode.rows):
+        assert row["step"] == number == len(row["history"])
+        PlanStep.parse(row["target"])
+        executed = json.loads(row["privileged"])
+        if number + 1 < len(episode.rows):
+            assert episode.rows[number + 1]["history"][-1]["step"] == executed["executed"]
+
+
+def test_a_students_mistakes_are_recorded_with_the_experts_step():
+    config = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, medium_share=0.0)
+
+    def student(observation):
+        return PlanStep((Action("Place", arm=Arm.RIGHT, object_id=observation.known_objects[0]),))
+
+    episode = run_correction(config, 10, None, student)
+    again = run_correction(config, 10, None, student)
+    for name in ("target", "image", "history", "privileged"):
+        assert [row[name] for row in episode.rows] == [row[name] for row in again.rows]
+    assert episode.success
+    notes = [json.loads(row["privileged"]) for row in episode.rows]
+    assert notes[0]["origin"] == "student"
+    assert "HandEmpty" in episode.rows[1]["history"][0]["feedback"]
+    assert {row["target"] for row in episode.rows} <= {note["executed"] for note in notes if note["origin"] == "expert"}
+    # a step that has just failed is not tried again: the expert takes over
+    assert [note["origin"] for note in notes[:2]] == ["student", "expert"]
+    assert run_correction(config, 10, None, lambda observation: None).rows[-1]["target"] == episode.rows[-1]["target"]
+
+
+class _Seen:
+    known_objects = ("Mug_1", "SideTable_1")
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        PlanStep((Action("GoTo", object_id="Mug_1", amount=0.5),)),
+        PlanStep((Action("MoveDown", amount=0.2),)),
+        PlanStep((Action("Pick", arm=Arm.LEFT, object_id="Mug_1"), Action("Pick", arm=Arm.RIGHT, object_id="Bowl_1"))),
+    ],
+)
+def test_perturbed_steps_are_legal_and_differ(step):
+    rng = np.random.default_rng(0)
+    texts = {perturbed(step, _Seen(), rng)[0].to_text() for _ in range(40)}  # type: ignore[arg-type]
+    assert all(PlanStep.parse(text).to_text() == text for text in texts)
+    assert len(texts) > 5
+
+
+def test_arguments_are_read_and_wrong_ones_refused(capsys):
+    assert read_arguments(CollectConfig, ["kind=views", "out=x", "count=3", "robots=[x1]"]).robots == ("x1",)
+    with pytest.raises(ConfigError, match="views, demos, exercises, judgements"):
+        read_arguments(CollectConfig, ["kind=pictures", "out=x", "count=3"])
+    with pytest.raises(ConfigError, match="'count' is not key=value"):
+        read_arguments(CollectConfig, ["count"])
+    with pytest.raises(ConfigError, match="count must be at least 1, got 0"):
+        read_arguments(CollectConfig, ["kind=views", "out=x", "count=0"])
+    with pytest.raises(ConfigError, match=r"noise must be within \[0, 1\], got 2"):
+        read_arguments(CollectConfig, ["kind=demos", "out=x", "count=1", "noise=2"])
+    with pytest.raises(ConfigError, match="robots and rooms must not be empty"):
+        read_arguments(CollectConfig, ["kind=demos", "out=x", "count=1", "robots=[]"])
+    assert main(["colour=red"]) == 2
+    assert "colour" in capsys.readouterr().err

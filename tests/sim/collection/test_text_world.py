@@ -1,0 +1,97 @@
+"""Exercises in words: the same for the same number, solvable, and every refusal met with what mends it."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pytest
+
+from configs.schema.collect import CollectConfig
+from data.records import PlanStep
+from sim.collection.collect import rows_of_part
+from sim.collection.text_world import Exercise, corrections_of_part, play
+from sim.scene.catalogue import load_catalogue
+
+#: Types that a hand picks up.
+SMALL = {kind.name for kind in load_catalogue().types.values() if kind.pickupable}
+CONFIG = CollectConfig("exercises", "unused", 300, part_size=300)
+
+
+@pytest.fixture(scope="module")
+def episodes() -> list[Exercise]:
+    return [play(CONFIG, index) for index in range(300)]
+
+
+def test_an_episode_is_a_function_of_its_number(episodes: list[Exercise]) -> None:
+    assert play(CONFIG, 7).rows == episodes[7].rows
+    assert rows_of_part(CONFIG, 0) == [row for episode in episodes for row in episode.rows]
+    assert episodes[7].rows != episodes[8].rows
+
+
+def test_most_episodes_end_in_success_in_spite_of_mistakes(episodes: list[Exercise]) -> None:
+    assert sum(episode.success for episode in episodes) > 270
+    codes = set().union(*(episode.codes for episode in episodes))
+    wanted = {"ok", "TooFar", "BodyTooHigh", "BodyTooLow", "HandEmpty", "HandOccupied", "AlreadyHeld", "AlreadyInState"}
+    assert wanted | {"ObjectNotKnown", "BothHandsBusy", "GraspMissed"} <= codes
+
+
+def test_steps_name_known_objects_and_follow_from_the_log(episodes: list[Exercise]) -> None:
+    heights = 0
+    for row in (row for episode in episodes for row in episode.rows):
+        step = PlanStep.parse(row["target"])
+        assert step.to_text() == row["target"]
+        assert {action.object_id for action in step.actions} - {None} <= set(row["known"])
+        assert set(row["visible"]) <= set(row["known"])
+        codes = [item["feedback"].rsplit(" ", 1)[1] for item in row["history"]]
+        if step.actions[0].name in ("MoveUp", "MoveDown"):
+            heights += 1
+            refused = "BodyTooLow" if step.actions[0].name == "MoveUp" else "BodyTooHigh"
+            assert refused in codes
+        assert not re.match("Rotate|MoveAhead", row["target"])
+        if codes and codes[-1] == "TooFar" and len(step.actions) == 1:
+            last = row["history"][-1]["step"]
+            assert last != row["target"]
+    assert heights > 20
+
+
+def test_judgements_are_balanced_and_true(episodes: list[Exercise]) -> None:
+    rows = rows_of_part(dataclasses.replace(CONFIG, kind="judgements"), 0)
+    assert len(rows) == 300
+    assert 0.4 < sum(row["target"] == "yes" for row in rows) / len(rows) < 0.6
+    for episode, row in zip(episodes, rows, strict=True):
+        ends = episode.moments[-1]
+        if row["target"] == "yes":
+            assert episode.success
+            assert row["instruction"] == ends["instruction"]
+            assert row["history"] == ends["history"]
+        else:
+            assert not episode.success or row["step"] < ends["step"] or row["instruction"] != ends["instruction"]
+
+
+def test_what_is_held_already_is_not_picked_again(episodes: list[Exercise]) -> None:
+    for row in (row for episode in episodes for row in episode.rows):
+        if row["history"] and row["history"][-1]["feedback"].endswith("AlreadyHeld"):
+            asked = re.findall(r"Pick\(\w+, (\w+)\)", row["history"][-1]["step"])
+            assert not any(f", {name})" in row["target"] and row["target"].startswith("Pick") for name in asked)
+
+
+def test_what_a_student_picks_up_for_nothing_is_put_back() -> None:
+    def student(moments: Sequence[Mapping[str, Any]]) -> list[PlanStep | None]:
+        steps: list[PlanStep | None] = []
+        for moment in moments:
+            spare = [name for name in moment["known"] if name not in moment["named"] and name.rsplit("_", 1)[0] in SMALL]
+            verbs = ("GoTo({})", "Pick(left, {})", "Pick(right, {})")
+            steps.append(PlanStep.parse(verbs[moment["step"] % 3].format(spare[0])) if spare else None)
+        return steps
+
+    config = dataclasses.replace(CONFIG, count=60, part_size=60, noise=0.0)
+    rows = list(corrections_of_part(config, 0, student))
+    back = 0
+    for row in rows:
+        last = row["history"][-1]["feedback"] if row["history"] else ""
+        picked = re.match(r"Pick\(\w+, (\w+)\) ok", last)
+        back += picked is not None and picked[1] not in row["named"] and row["target"].startswith(("Place", "GoTo"))
+    assert back > 5

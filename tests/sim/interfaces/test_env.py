@@ -1,0 +1,62 @@
+"""The Gymnasium environment follows Gymnasium's contract."""
+
+import warnings
+
+import gymnasium as gym
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from sim.interfaces.env import DualThorEnv
+from sim.session.session import FreePlay
+
+
+@pytest.fixture(scope="module")
+def env():
+    made = DualThorEnv("x1", tasks=(FreePlay("living_room_1", step_budget=3),), image_size=56, render_mode="rgb_array")
+    yield made
+    made.close()
+
+
+def test_check_env():
+    made = DualThorEnv("x1", tasks=(FreePlay("living_room_1", step_budget=2),), image_size=56)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        check_env(made, skip_render_check=True)
+    assert isinstance(made, gym.Env)
+    made.close()
+
+
+def test_text_actions(env):
+    observation, info = env.reset(seed=3)
+    assert env.observation_space.contains(observation)
+    assert info["instruction"] and info["invalid_action"] == ""
+    _, reward, done, truncated, info = env.step("Rotate me please")
+    assert "not an action" in info["invalid_action"]
+    assert (reward, done, truncated) == (0.0, False, False)
+    _, _, done, truncated, info = env.step("RotateLeft(30)")
+    assert info["feedback"] == "RotateLeft(30) ok" and not done and not truncated
+    _, _, done, truncated, _ = env.step("RotateRight(30)")
+    assert truncated and not done
+    assert env.render().shape == (480, 480, 3)
+
+
+def test_done_terminates(env):
+    env.reset(seed=1)
+    assert env.step("Done()")[2]
+
+
+def test_bad_arguments(env):
+    with pytest.raises(ValueError, match=r"task index 5 outside 0\.\.0"):
+        env.reset(options={"task": 5})
+    with pytest.raises(ValueError, match="unknown render_mode 'human'"):
+        DualThorEnv(render_mode="human")
+
+
+def test_invalid_text_uses_up_the_budget():
+    env = DualThorEnv("x1", image_size=56)
+    env.reset(seed=0)
+    budget = env.session.task.step_budget
+    ends = [env.step("what?")[3] for _ in range(budget)]
+    assert not any(ends[:-1])
+    assert ends[-1]
+    env.close()

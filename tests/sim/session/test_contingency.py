@@ -1,0 +1,88 @@
+"""Contingencies: draws are keyed, frequencies follow the difficulty, configs are checked."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from scipy.stats import chisquare
+
+from configs.validate import ConfigError, build
+from sim.session.contingency import DIFFICULTIES, Contingency, ContingencyConfig, OutcomeRule, load_contingency
+
+FILLED = {"isFilledWithLiquid": True}
+CONFIG = load_contingency()
+
+
+def test_the_papers_cup():
+    cup = Contingency(CONFIG, "natural", 0).distribution("Pick", "Mug", FILLED)
+    assert cup == pytest.approx({"success": 0.8, "spilled": 0.1, "broken": 0.1})
+
+
+@pytest.mark.parametrize(("difficulty", "rate"), [("easy", 1.0), ("medium", 0.5), ("hard", 0.2)])
+def test_success_rate_of_a_difficulty(difficulty, rate):
+    luck = Contingency(CONFIG, difficulty, 5)
+    counts = Counter(luck.draw(step, "Pick", "Mug_1", "Mug", FILLED) for step in range(4000))
+    assert counts["success"] / 4000 == pytest.approx(rate, abs=0.03)
+    assert counts["spilled"] == pytest.approx(counts["broken"], rel=0.2, abs=1)
+
+
+def test_draws_depend_on_the_key_only():
+    luck, same = Contingency(CONFIG, "medium", 7), Contingency(CONFIG, "medium", 7)
+    keys = [(step, arm_object) for step in range(30) for arm_object in ("Mug_1", "Mug_2")]
+    forward = [luck.draw(step, "Pick", name, "Mug", {}) for step, name in keys]
+    backward = [same.draw(step, "Pick", name, "Mug", {}) for step, name in reversed(keys)]
+    assert forward == backward[::-1]
+    other = Contingency(CONFIG, "medium", 8)
+    assert forward != [other.draw(step, "Pick", name, "Mug", {}) for step, name in keys]
+
+
+def test_a_success_at_hard_is_a_success_at_medium():
+    medium, hard = Contingency(CONFIG, "medium", 1), Contingency(CONFIG, "hard", 1)
+    for step in range(200):
+        if hard.draw(step, "Open", "Fridge_1", "Fridge", {}) == "success":
+            assert medium.draw(step, "Open", "Fridge_1", "Fridge", {}) == "success"
+
+
+def test_body_movements_always_succeed():
+    assert Contingency(CONFIG, "hard", 0).distribution("MoveAhead", "", {}) == {"success": 1.0}
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(ValueError, match="unknown difficulty 'mild'; allowed: easy"):
+        Contingency(CONFIG, "mild", 0)
+    with pytest.raises(ValueError, match="no contingency config 'nope'"):
+        load_contingency("nope")
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        ({"actions": ["Fly"], "types": [], "state": {}, "outcomes": {"success": 1.0}}, "unknown actions"),
+        ({"actions": ["Pick"], "types": [], "state": {}, "outcomes": {"success": 0.5, "melted": 0.5}}, "melted"),
+        ({"actions": ["Pick"], "types": [], "state": {}, "outcomes": {"success": 0.5, "broken": 0.2}}, "sum 0.7"),
+    ],
+)
+def test_bad_rules_are_refused(rule, message):
+    rates = dict.fromkeys(DIFFICULTIES, 1.0)
+    with pytest.raises(ConfigError, match=message):
+        build(ContingencyConfig, {"difficulties": rates, "rules": [rule]})
+
+
+def test_bad_difficulties_are_refused():
+    with pytest.raises(ConfigError, match="difficulties must be"):
+        build(ContingencyConfig, {"difficulties": {"easy": 1.0}, "rules": []})
+    with pytest.raises(ConfigError, match=r"must lie in \[0, 1\], got 2"):
+        build(ContingencyConfig, {"difficulties": dict.fromkeys(DIFFICULTIES, 2.0), "rules": []})
+
+
+@pytest.mark.parametrize(
+    "rule", CONFIG.rules, ids=lambda rule: f"{'+'.join(rule.actions)}-{rule.types[0] if rule.types else 'any'}"
+)
+def test_observed_frequencies_match_the_file(rule: OutcomeRule) -> None:
+    """Chi-square over 4,000 draws per rule; the seeds are fixed, so this either holds or it does not."""
+    luck = Contingency(CONFIG, "natural", 5)
+    kind = rule.types[0] if rule.types else "Zebra"
+    draws = [luck.draw(step, rule.actions[0], f"{kind}_1", kind, dict(rule.state)) for step in range(4000)]
+    counts = np.array([draws.count(name) for name in rule.outcomes])
+    assert counts.sum() == len(draws)
+    assert chisquare(counts, len(draws) * np.array(list(rule.outcomes.values()))).pvalue > 0.001
