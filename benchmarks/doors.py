@@ -17,7 +17,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from data.records import Action, ActionOutcome, Arm, PlanStep
+from data.interface.actions import Arm
+from data.interface.feedback import ActionOutcome
+from data.interface.steps import Action, PlanStep
 from sim.scene.catalogue import MovingSpec
 from sim.scene.rooms import room_names
 from sim.session.session import FreePlay, Session

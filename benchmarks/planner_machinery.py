@@ -28,7 +28,7 @@ import sim.tasks  # noqa: F401  # chooses the OpenGL backend before anything dra
 from configs.compose import compose
 from configs.schema.eval import EvalConfig
 from configs.validate import build
-from data.records import EpisodeRecord, Outcome
+from data.interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.planners.memory import MemoryFileError, check_memory
 from sim.benchmark.certificates import load_certificates

@@ -21,7 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data.records import ACTIONS, ActionKind, PlanStep
+from data.interface.actions import ACTIONS, ActionKind
+from data.interface.steps import PlanStep
 from data.shards import ShardError, ShardReader, decode_png
 from proprio_mllm.planners.chat.embedding import SentenceEmbedder
 from proprio_mllm.planners.chat.recall import Key, MomentRecall, TaskRecall, load_moments

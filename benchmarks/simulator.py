@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 import sim.tasks
-from data.records import PlanStep
+from data.interface.steps import PlanStep
 from sim.robots.spec import load_robot
 from sim.scene.compiler import build_spec
 from sim.session.session import FreePlay, Session
@@ -158,7 +158,7 @@ def camera_frames(size: int = 256) -> dict[str, float]:
 def memory() -> dict[str, float]:
     """Unshared and shared resident memory of a process with one environment, megabytes."""
     code = (
-        "from sim.session.session import Session, FreePlay\nfrom data.records import PlanStep\n"
+        "from sim.session.session import Session, FreePlay\nfrom data.interface.steps import PlanStep\n"
         "s = Session('h1', image_size=224)\ns.reset(FreePlay('kitchen_1'), 0)\n"
         "for t in ('GoTo(Bottle_1)', 'Pick(left, Bottle_1)'): s.step(PlanStep.parse(t))\n"
         "rows = dict(l.split(':') for l in open('/proc/self/smaps_rollup').read().splitlines()[1:])\n"

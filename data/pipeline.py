@@ -26,9 +26,9 @@ from data.cluster import ray_instance
 from data.filter import admit, gate, reason_group
 from data.generator import GENERATOR_VERSION, write_dataset
 from data.humanml3d import DatasetError
+from data.interface.motion import Motion
 from data.metrics import Metrics, evaluate
 from data.motion import FPS
-from data.records import Motion
 from data.retarget import Retargeter
 from data.shards import Manifest, ShardWriter, config_hash
 from data.sources import clip_ids, read_clip

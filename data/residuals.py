@@ -17,11 +17,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from data.interface.bodies import SIDES
 from data.least_squares import System
 from data.targets import Targets
 from sim.robots.kinematics import RobotModel
 from sim.robots.self_collision import close_rows, default_shapes, moved_by, solid_on
-from sim.robots.spec import SIDES
 
 __all__ = ["BodyFrames", "Residuals"]
 

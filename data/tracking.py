@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from data.records import Motion
+from data.interface.motion import Motion
 from sim.robots.kinematics import RobotModel
 
 __all__ = ["FAILED_M", "Tracked", "Tracker", "Tracking"]

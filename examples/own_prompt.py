@@ -10,7 +10,8 @@ failures of the server are no scores. Copy it, and write a prompt of your own. A
 import numpy as np
 from pydantic import BaseModel
 
-from data.records import Feedback, Observation
+from data.interface.feedback import Feedback
+from data.interface.observation import Observation
 from proprio_mllm.backends.protocol import Backend
 from proprio_mllm.planners.chat.asking import Asker
 from proprio_mllm.planners.chat.manual import action_manual, role

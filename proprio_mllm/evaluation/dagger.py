@@ -24,7 +24,8 @@ from typing import TYPE_CHECKING, Any, Final
 from tqdm import tqdm
 
 from configs.schema.collect import CollectConfig
-from data.records import Observation, PlanStep
+from data.interface.observation import Observation
+from data.interface.steps import PlanStep
 from data.shards import ShardWriter
 from data.workers import start_worker
 from proprio_mllm.training.rollouts import CorrectionRequest

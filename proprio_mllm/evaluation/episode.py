@@ -22,7 +22,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from data.records import EpisodeRecord, Feedback, HistoryItem, Observation, Outcome, PlanStep
+from data.interface.episode import EpisodeRecord, Outcome
+from data.interface.feedback import Feedback
+from data.interface.observation import HistoryItem, Observation
+from data.interface.steps import PlanStep
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, attribute
 from proprio_mllm.evaluation.seeds import stream
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo, Usage

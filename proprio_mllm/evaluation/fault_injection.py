@@ -25,7 +25,11 @@ from typing import Final
 
 import numpy as np
 
-from data.records import Action, ActionKind, Arm, FailureCategory, Feedback, Observation, PlanStep
+from data.interface.actions import ActionKind, Arm
+from data.interface.failures import FailureCategory
+from data.interface.feedback import Feedback
+from data.interface.observation import Observation
+from data.interface.steps import Action, PlanStep
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, parse_reply
 from sim.expert.expert import Expert
 from sim.session.session import Session

@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from configs.validate import ConfigError, build
-from data.records import EpisodeRecord, Outcome
+from data.interface.episode import EpisodeRecord, Outcome
 
 __all__ = ["LEDGER_VERSION", "EpisodeKey", "Ledger", "LedgerError", "key_of", "read_ledger", "scored"]
 

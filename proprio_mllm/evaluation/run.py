@@ -29,7 +29,7 @@ from configs.schema.eval import CHAT_KINDS, EvalConfig, PlannerConfig
 from data.cluster import import_ray
 from data.code_files import source_digest, split_source
 from data.files import file_hash, write_text
-from data.records import EpisodeRecord, Outcome
+from data.interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.backends.factory import check_cap, make_backend, told_revision
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest

@@ -28,7 +28,7 @@ from typing import Any, Final
 import numpy as np
 
 from configs.schema.eval import PlannerConfig
-from data.records import Observation
+from data.interface.observation import Observation
 from data.workers import start_worker
 from proprio_mllm.evaluation.batching import AskingPlanner, Batcher, batch_planner
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo

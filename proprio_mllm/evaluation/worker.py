@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from configs.schema.backend import BackendConfig
 from configs.schema.eval import DifficultyName, PlannerConfig, StartName
 from configs.schema.robot import RobotConfig
-from data.records import EpisodeRecord, Outcome
+from data.interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest, CostCapError, UnreachableError
 from proprio_mllm.evaluation.batching import answer_all
 from proprio_mllm.evaluation.episode import (

@@ -20,27 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs.schema.model import CentroidName
-from data.records import Camera
+from data.interface.bodies import KEY_BODIES
+from data.interface.observation import Camera
 
-__all__ = ["KEY_BODIES", "arm_length_m", "body_point_in_pelvis", "centroid", "project", "unproject"]
+__all__ = ["arm_length_m", "body_point_in_pelvis", "centroid", "project", "unproject"]
 
-#: Order of the key bodies in every (K, 3) array, as in `sim.robots.spec`.
-KEY_BODIES: tuple[str, ...] = (
-    "torso",
-    "head",
-    "left_shoulder",
-    "left_elbow",
-    "left_hand",
-    "right_shoulder",
-    "right_elbow",
-    "right_hand",
-    "left_hip",
-    "left_knee",
-    "left_ankle",
-    "right_hip",
-    "right_knee",
-    "right_ankle",
-)
 _INDEX = {name: i for i, name in enumerate(KEY_BODIES)}
 _ARMS = [_INDEX[f"{side}_{part}"] for side in ("left", "right") for part in ("elbow", "hand")]
 #: A point behind the camera is projected from this depth, metres: far outside the image on the side where it is.

@@ -6,7 +6,7 @@ Both go through `plan_example`, so that the model sees the same text, image and 
 from __future__ import annotations
 
 from configs.schema.model import ModelConfig
-from data.records import Observation
+from data.interface.observation import Observation
 from proprio_mllm.model.batch import Example, View
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import plan_prompt, with_answer

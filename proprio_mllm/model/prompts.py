@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
-from data.records import HistoryItem
+from data.interface.observation import HistoryItem
 from proprio_mllm.model.chat import Message
 from proprio_mllm.model.vocabulary import motion_text
 

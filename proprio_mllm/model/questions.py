@@ -15,8 +15,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action
-from proprio_mllm.model.geometry import KEY_BODIES, arm_length_m
+from data.interface.bodies import KEY_BODIES
+from data.interface.steps import Action
+from proprio_mllm.model.geometry import arm_length_m
 from proprio_mllm.model.prompts import Style
 
 __all__ = ["QUESTIONS", "arm_answer", "ask", "body_shift_m", "distance_answer", "height_answer", "shift_answer", "side_answer"]

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from configs.validate import ConfigError, build
 from data.files import file_hash
-from data.records import HistoryItem, PlanStep
+from data.interface.observation import HistoryItem
+from data.interface.steps import PlanStep
 from proprio_mllm.planners.protocol import succeeded
 
 __all__ = [

@@ -25,7 +25,8 @@ from tqdm import tqdm
 from configs.arguments import read_arguments
 from configs.validate import ConfigError
 from data.files import file_hash, new_folder, write_text
-from data.records import HistoryItem, PlanStep
+from data.interface.observation import HistoryItem
+from data.interface.steps import PlanStep
 from data.shards import ShardError, ShardReader, decode_png
 from proprio_mllm.planners.chat.sight import SightError, image_encoder, weights_digest
 from proprio_mllm.planners.memory import (

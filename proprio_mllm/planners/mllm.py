@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from data.records import Feedback, Observation
+from data.interface.feedback import Feedback
+from data.interface.observation import Observation
 from proprio_mllm.model.batch import Collator
 from proprio_mllm.model.building import load_model, load_motion
 from proprio_mllm.model.modeling import ProprioMLLM

@@ -15,7 +15,9 @@ from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from data.records import ActionError, Feedback, HistoryItem, Observation, PlanStep
+from data.interface.feedback import Feedback
+from data.interface.observation import HistoryItem, Observation
+from data.interface.steps import ActionError, PlanStep
 
 __all__ = [
     "ONE_CALL",

@@ -11,7 +11,10 @@ import time
 
 import numpy as np
 
-from data.records import ACTIONS, Action, ActionKind, Arm, Feedback, Observation, PlanStep
+from data.interface.actions import ACTIONS, ActionKind, Arm
+from data.interface.feedback import Feedback
+from data.interface.observation import Observation
+from data.interface.steps import Action, PlanStep
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 
 __all__ = ["RandomPlanner"]

@@ -22,7 +22,7 @@ import datasets
 from datasets.arrow_writer import ArrowWriter
 
 from data.files import file_hash, new_folder, write_text
-from data.records import Outcome
+from data.interface.episode import Outcome
 from proprio_mllm.report.arguments import read_named
 from proprio_mllm.report.digest import run_digest
 from proprio_mllm.report.frames import ActedOut

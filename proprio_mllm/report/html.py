@@ -24,7 +24,7 @@ import jinja2
 
 from configs.validate import ConfigError
 from data.files import write_text
-from data.records import EpisodeRecord, Outcome
+from data.interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.report.arguments import read_named
 from proprio_mllm.report.digest import episode_digest, run_digest
 from proprio_mllm.report.frames import ActedOut, act_out, episode_id

@@ -22,7 +22,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from data.records import Action, ActionError, EpisodeRecord, Outcome
+from data.interface.episode import EpisodeRecord, Outcome
+from data.interface.steps import Action, ActionError
 from proprio_mllm.report.statistics import cluster_bootstrap
 
 __all__ = ["Certificate", "Extras", "References", "extras_of", "path_efficiency", "recoveries"]

@@ -15,7 +15,10 @@ from pathlib import Path
 
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.validate import build
-from data.records import EpisodeRecord, Feedback, HistoryItem, Observation, PlanStep
+from data.interface.episode import EpisodeRecord
+from data.interface.feedback import Feedback
+from data.interface.observation import HistoryItem, Observation
+from data.interface.steps import PlanStep
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT
 from proprio_mllm.evaluation.run import plan_episodes, select_tasks
 from proprio_mllm.evaluation.seeds import episode_seed

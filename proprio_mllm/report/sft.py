@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from data.records import Observation, Outcome
+from data.interface.episode import Outcome
+from data.interface.observation import Observation
 from data.shards import encode_png
 from proprio_mllm.evaluation.pool import run_jobs
 from proprio_mllm.model.chat import to_chat

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from data.records import EpisodeRecord, Outcome
+from data.interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.ledger import read_ledger
 from proprio_mllm.evaluation.naming import options_of
 from proprio_mllm.report.metrics import References

@@ -25,7 +25,8 @@ from rich.progress import Progress
 from configs.arguments import read_arguments
 from configs.validate import ConfigError
 from data.files import write_text
-from data.records import FailureCategory, Outcome
+from data.interface.episode import Outcome
+from data.interface.failures import FailureCategory
 from proprio_mllm.evaluation.pool import run_jobs
 from proprio_mllm.evaluation.scripted import Cell, CellRunner, ScriptedResult, cells
 from proprio_mllm.report.statistics import wilson

@@ -1,6 +1,6 @@
 """Goals, failure codes and margins in words, for people who read an episode.
 
-Margins are signed and named as `sim.skills.failures` says; goals are printed from their plain form, so that a new kind of
+Margins are signed and named as `data.interface.failures` says; goals are printed from their plain form, so that a new kind of
 predicate needs nothing here.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from sim.skills.failures import FAILURES, FailureCode
+from data.interface.failures import FAILURES, FailureCode
 
 __all__ = ["code_in_words", "goal_in_words", "margins_in_words"]
 

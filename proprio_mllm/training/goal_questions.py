@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import HistoryItem
+from data.interface.observation import HistoryItem
 from proprio_mllm.model.batch import Example
 from proprio_mllm.model.prompts import answers, critic_prompt, self_ask_prompt, with_answer
 from proprio_mllm.training.sources import Demos

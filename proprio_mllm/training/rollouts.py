@@ -20,8 +20,8 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from data.interface.observation import Camera, HistoryItem, Observation
 from data.motion import KEY_BODY_COUNT
-from data.records import Camera, HistoryItem, Observation
 from data.shards import ShardReader, decode_motion, decode_png, encode_png
 from proprio_mllm.model.batch import View
 

@@ -22,8 +22,8 @@ import torch
 from numpy.typing import NDArray
 
 from configs.schema.model import ModelConfig
+from data.interface.observation import Camera
 from data.motion import HAND_OPENING, KEY_BODY_COUNT, OPEN_HAND
-from data.records import Camera
 from data.shards import Manifest, ShardError, ShardReader, decode_depth, decode_motion, decode_png, decode_segmentation
 from proprio_mllm.model.batch import Example, View
 from proprio_mllm.model.chat import Message

@@ -7,7 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from data.records import Action, ActionError, HistoryItem
+from data.interface.observation import HistoryItem
+from data.interface.steps import Action, ActionError
 
 __all__ = ["asked_relation", "history_of", "open_hands", "states_from_log"]
 

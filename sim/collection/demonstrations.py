@@ -20,7 +20,9 @@ from typing import Any, Final
 import numpy as np
 
 from configs.schema.collect import CollectConfig
-from data.records import Action, ActionKind, Observation, PlanStep
+from data.interface.actions import ActionKind
+from data.interface.observation import Observation
+from data.interface.steps import Action, PlanStep
 from data.shards import encode_png
 from sim.collection.students import accepted
 from sim.expert.expert import Expert

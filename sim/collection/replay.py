@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs.schema.data import ReplayConfig
+from data.interface.motion import Motion
 from data.motion import yaw_from_quaternion
 from data.pipeline import Pictures
-from data.records import Motion
 from data.shards import encode_png
 from sim.collection.view_sampling import camera_in_pelvis
 from sim.robots.spec import load_robot

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from data.records import HistoryItem, PlanStep
+from data.interface.observation import HistoryItem
+from data.interface.steps import PlanStep
 
 __all__ = ["accepted"]
 

@@ -21,10 +21,12 @@ from typing import Any, Final
 import numpy as np
 
 from configs.schema.collect import CollectConfig
-from data.records import Action, ActionKind, Arm, HistoryItem, PlanStep
+from data.interface.actions import ActionKind, Arm
+from data.interface.failures import FailureCode
+from data.interface.observation import HistoryItem
+from data.interface.steps import Action, PlanStep
 from sim.collection.students import accepted
 from sim.expert.jobs import Facts, Job, plan_jobs
-from sim.skills.failures import FailureCode
 from sim.tasks.drafts import Draft, NoDraft, Scene
 from sim.tasks.families import CATEGORIES, FAMILIES, draw, family_of
 from sim.tasks.sample import UNSEEN_TYPES, rng_for, scene_of

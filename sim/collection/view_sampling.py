@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs.schema.collect import CollectConfig
+from data.interface.actions import Arm
+from data.interface.bodies import SIDES
 from data.motion import encode_frames, world_to_heading
-from data.records import Arm
 from data.shards import encode_png
 from sim.robots.build_solver import robot_kit
-from sim.robots.spec import SIDES
 from sim.scene.catalogue import load_catalogue
 from sim.scene.compiler import BASE_JOINTS
 from sim.skills.body import ready_posture

@@ -16,11 +16,13 @@ from typing import Final
 
 import numpy as np
 
-from data.records import Action, Arm, PlanStep
+from data.interface.actions import Arm
+from data.interface.failures import FailureCode
+from data.interface.steps import Action, PlanStep
 from sim.expert.jobs import Facts, Job, plan_jobs
 from sim.expert.lookahead import HEIGHT_STEP_M, Rehearsal
 from sim.session.session import Session
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.skills.navigation import Stance, wrap_angle
 from sim.skills.registry import excludes
 from sim.tasks.predicates import Predicate

@@ -13,7 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from data.records import ACTIONS, Action, ActionKind, Arm
+from data.interface.actions import ACTIONS, ActionKind, Arm
+from data.interface.steps import Action
 from sim.tasks.predicates import Predicate
 
 __all__ = ["Facts", "Job", "pending_leaves", "plan_jobs"]

@@ -1,4 +1,4 @@
-"""Other simulators' action names: AI2-THOR's and DualTHOR's, mapped onto the action grammar of `data.records`.
+"""Other simulators' action names: AI2-THOR's and DualTHOR's, mapped onto the action grammar of `data.interface.steps`.
 
 Units follow the names' origin. DualTHOR: `moveahead` with magnitude 1 is 1 m, `moveup` 0.1 m, `rotateright` 90 degrees.
 AI2-THOR: `moveMagnitude` in metres, `degrees` for rotations. Episode control (undo, save, teleport ...) is not part of the
@@ -12,7 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from data.records import ACTIONS, Action, ActionKind, Arm
+from data.interface.actions import ACTIONS, ActionKind, Arm
+from data.interface.steps import Action
 
 __all__ = ["ALIASES", "ARGUMENTS", "number", "to_action"]
 

@@ -21,12 +21,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action, ActionOutcome, PlanStep
+from data.interface.failures import FailureCode
+from data.interface.feedback import ActionOutcome
+from data.interface.steps import Action, PlanStep
 from sim.interfaces.aliases import number, to_action
 from sim.interfaces.poses import interactable_poses, random_placements, set_object_poses
 from sim.scene.rooms import load_room
 from sim.session.session import FreePlay, Session, SessionSnapshot, TaskLike
-from sim.skills.failures import FailureCode
 from sim.skills.navigation import wrap_angle
 
 __all__ = ["THOR_CODES", "Controller", "Event"]

@@ -24,7 +24,9 @@ from typing import Any, Final
 import imageio.v3 as iio
 import numpy as np
 
-from data.records import ActionOutcome, Arm, PlanStep
+from data.interface.actions import Arm
+from data.interface.feedback import ActionOutcome
+from data.interface.steps import PlanStep
 from sim.interfaces.aliases import to_action
 from sim.interfaces.poses import interactable_poses
 from sim.session.session import FreePlay, Session, SessionSnapshot

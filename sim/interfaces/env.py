@@ -1,9 +1,9 @@
 """Gymnasium environment: plan steps as text in, images and proprioception out, reward when the goals hold.
 
 For users of reinforcement-learning tooling; the evaluation uses `sim.session.session` directly. The action is a plan step in
-the textual grammar of `data.records` (`Pick(left, Mug_1) & Open(right, Fridge_1)`). Text outside the grammar changes nothing,
-costs a step and is reported in `info`. Paper: DualTHOR as an environment; the reward is ours (share of goal conditions that
-hold, 1 at success).
+the textual grammar of `data.interface.steps` (`Pick(left, Mug_1) & Open(right, Fridge_1)`). Text outside the grammar changes
+nothing, costs a step and is reported in `info`. Paper: DualTHOR as an environment; the reward is ours (share of goal
+conditions that hold, 1 at success).
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from data.interface.bodies import KEY_BODIES
+from data.interface.observation import Observation
+from data.interface.steps import ActionError, PlanStep
 from data.motion import N_FEATURES
-from data.records import ActionError, Observation, PlanStep
-from sim.robots.spec import KEY_BODIES
 from sim.session.session import FreePlay, Session, TaskLike
 from sim.world.recorder import HISTORY_FRAMES
 

@@ -10,8 +10,9 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull
 
+from data.interface.bodies import KEY_BODIES
 from sim.robots.self_collision import OwnBody
-from sim.robots.spec import KEY_BODIES, RobotSpec
+from sim.robots.spec import RobotSpec
 
 __all__ = ["RobotModel", "root_quaternion"]
 

@@ -23,7 +23,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from pink.limits import Limit
 
-from sim.robots.spec import SIDES, BodyShape, RobotSpec
+from data.interface.bodies import SIDES
+from sim.robots.spec import BodyShape, RobotSpec
 
 if TYPE_CHECKING:
     from sim.robots.kinematics import RobotModel

@@ -17,27 +17,10 @@ import yaml
 
 from configs.assets import asset_files
 from configs.validate import ConfigError, build
+from data.interface.bodies import KEY_BODIES, SIDES
 
-__all__ = ["KEY_BODIES", "SIDES", "ArmSpec", "BodyShape", "FootSpec", "HandSpec", "RobotSpec", "available_robots", "load_robot"]
+__all__ = ["ArmSpec", "BodyShape", "FootSpec", "HandSpec", "RobotSpec", "available_robots", "load_robot"]
 
-SIDES = ("left", "right")
-#: Bodies whose positions make up a motion frame, in this order, shared by all robots (and matched to SMPL joints in `data`).
-KEY_BODIES = (
-    "torso",
-    "head",
-    "left_shoulder",
-    "left_elbow",
-    "left_hand",
-    "right_shoulder",
-    "right_elbow",
-    "right_hand",
-    "left_hip",
-    "left_knee",
-    "left_ankle",
-    "right_hip",
-    "right_knee",
-    "right_ankle",
-)
 _SPECS = Path(__file__).parent / "specs"
 
 

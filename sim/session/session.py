@@ -17,7 +17,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from data.records import Action, ActionKind, ActionOutcome, Arm, Feedback, HistoryItem, Observation, PlanStep
+from data.interface.actions import ActionKind, Arm
+from data.interface.feedback import ActionOutcome, Feedback
+from data.interface.observation import HistoryItem, Observation
+from data.interface.steps import Action, PlanStep
 from sim.robots.build_solver import robot_kit
 from sim.robots.spec import load_robot
 from sim.scene.objects import Placement

@@ -17,11 +17,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action, Arm
+from data.interface.actions import Arm
+from data.interface.failures import FailureCode
+from data.interface.steps import Action
 from sim.scene.objects import MovingPart, ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_open_close, check_toggle
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.skills.lids import closed_on, led_on, plan_lead, plan_tab
 from sim.skills.locomotion import sweep
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow

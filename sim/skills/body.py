@@ -22,7 +22,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action, Arm
+from data.interface.actions import Arm
+from data.interface.steps import Action
 from sim.robots.arm_ik import PerArmSolver
 from sim.robots.build_solver import RobotKit, robot_kit
 from sim.robots.self_collision import SELF_TOUCH_M

@@ -6,10 +6,11 @@ the object allows, then weight, then access. Reach is found out later, by the sk
 
 from __future__ import annotations
 
-from data.records import Arm
+from data.interface.actions import Arm
+from data.interface.failures import FailureCode
 from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.world.liquids import capacity_l, spout
 
 __all__ = [

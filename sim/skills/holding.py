@@ -7,11 +7,12 @@ held falls, and a door with a spring shuts. Paper: holding and releasing of the 
 
 from __future__ import annotations
 
-from data.records import Action
+from data.interface.failures import FailureCode
+from data.interface.steps import Action
 from sim.skills.articulate import plan_handle
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_hold
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.skills.grasps import Grasp
 from sim.skills.manipulate import GRASP_GAP_M, Luck, grip, plan_pick, retreat, stow
 from sim.skills.plan_cache import remembered

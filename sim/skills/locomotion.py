@@ -15,9 +15,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action, Arm
+from data.interface.actions import Arm
+from data.interface.failures import FailureCode
+from data.interface.steps import Action
 from sim.skills.body import Body
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.skills.navigation import NavigationMap, Stance, wrap_angle
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.skills.trajectory import min_jerk, plan, plan_polyline

@@ -15,11 +15,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action, Arm
+from data.interface.actions import Arm
+from data.interface.failures import FailureCode
+from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_pick, check_place
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.skills.grasps import Grasp, grasp_candidates
 from sim.skills.plan_cache import remembered
 from sim.skills.reach import Reach, blame, explained, fulfils, plan_reach, route

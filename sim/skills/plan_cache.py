@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable
 from typing import TypeVar
 
-from data.records import Action
+from data.interface.steps import Action
 from sim.skills.body import Body
 
 __all__ = ["remembered"]

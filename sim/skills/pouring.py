@@ -14,11 +14,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action, Arm
+from data.interface.actions import Arm
+from data.interface.failures import FailureCode
+from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_fill, check_pour
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import Luck, nudge, plan_bring, stow
 from sim.skills.plan_cache import remembered
 from sim.skills.reach import Reach

@@ -17,12 +17,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action, Arm
+from data.interface.actions import Arm
+from data.interface.failures import FailureCode
+from data.interface.steps import Action
 from sim.scene.objects import MovingPart, ObjectInstance
 from sim.skills.body import ArmGoal, Body, wait
 from sim.skills.clearance import TOUCH_M
 from sim.skills.door import Door
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.skills.locomotion import step_to, sweep
 from sim.skills.manipulate import GRASP_GAP_M, stow
 from sim.skills.navigation import Stance

@@ -13,9 +13,10 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Arm
+from data.interface.actions import Arm
+from data.interface.failures import FailureCode
 from sim.skills.body import REACH_TOLERANCE_M, ArmGoal, Body
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.skills.reach_map import HandPose
 
 __all__ = ["Reach", "blame", "explained", "plan_reach", "route"]

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from data.records import Action, PlanStep
+from data.interface.failures import FailureCode
+from data.interface.steps import Action, PlanStep
 from sim.skills import articulate, holding, locomotion, manipulate, pouring, set_down, tools, two_arm
 from sim.skills.body import Body
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import Luck
 from sim.skills.push import Push
 from sim.skills.runner import Skill, refuse

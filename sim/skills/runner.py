@@ -13,8 +13,10 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from typing import Final
 
-from data.records import Action, ActionOutcome
-from sim.skills.failures import FailureCode, SkillFailure, failed, succeeded
+from data.interface.failures import FailureCode
+from data.interface.feedback import ActionOutcome
+from data.interface.steps import Action
+from sim.skills.failures import SkillFailure, failed, succeeded
 
 __all__ = ["CONTROL_DT_S", "Skill", "run_skills"]
 

@@ -16,12 +16,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action, Arm
+from data.interface.actions import Arm
+from data.interface.failures import FailureCode
+from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body, BothGoal, wait
 from sim.skills.checks import check_place_both
 from sim.skills.clearance import TOUCH_M
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import Luck, upright
 from sim.skills.plan_cache import remembered
 from sim.skills.reach import blame

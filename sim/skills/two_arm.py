@@ -13,11 +13,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action, Arm
+from data.interface.actions import Arm
+from data.interface.failures import FailureCode
+from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body, BothGoal, wait
 from sim.skills.checks import check_lift
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.skills.grasps import solid_box
 from sim.skills.manipulate import GRASP_GAP_M, Luck
 from sim.skills.plan_cache import remembered

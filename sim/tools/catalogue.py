@@ -16,13 +16,13 @@ from rich.console import Console
 from rich.table import Table
 
 from configs.validate import ConfigError
-from data.records import ACTIONS
+from data.interface.actions import ACTIONS
+from data.interface.failures import FAILURES
 from sim.interfaces.aliases import ALIASES
 from sim.robots.spec import available_robots, load_robot
 from sim.scene.catalogue import load_catalogue
 from sim.scene.rooms import load_room, room_names
 from sim.session.contingency import DIFFICULTIES, OUTCOMES
-from sim.skills.failures import FAILURES
 from sim.world.rendering import CAMERAS
 
 __all__ = ["inventory", "main"]

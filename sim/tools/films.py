@@ -17,7 +17,7 @@ import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import PlanStep
+from data.interface.steps import PlanStep
 from sim.robots.spec import available_robots
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session

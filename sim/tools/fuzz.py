@@ -22,13 +22,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from configs.arguments import read_arguments
 from configs.validate import ConfigError
-from data.records import ACTIONS, ActionKind
+from data.interface.actions import ACTIONS, ActionKind
+from data.interface.failures import FAILURES
 from data.workers import start_worker
 from sim.interfaces.aliases import ALIASES
 from sim.interfaces.controller import Controller, Event
 from sim.robots.spec import available_robots
 from sim.scene.rooms import room_names
-from sim.skills.failures import FAILURES
 from sim.world.liquids import balance_l
 
 __all__ = ["FuzzConfig", "Tally", "calls", "check", "fuzz", "main"]

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.records import Action, PlanStep
+from data.interface.steps import Action, PlanStep
 from sim.expert.expert import Expert
 from sim.robots.spec import load_robot
 from sim.scene.catalogue import load_catalogue

@@ -22,7 +22,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from configs.arguments import read_arguments
 from configs.validate import ConfigError
-from data.records import ActionError, PlanStep
+from data.interface.steps import ActionError, PlanStep
 from sim.expert.expert import Expert
 from sim.session.session import FreePlay, Session, TaskLike
 from sim.skills.runner import CONTROL_DT_S

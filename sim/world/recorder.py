@@ -13,7 +13,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robots.spec import KEY_BODIES, SIDES, RobotSpec
+from data.interface.bodies import KEY_BODIES, SIDES
+from sim.robots.spec import RobotSpec
 
 __all__ = ["FRAME_DT_S", "HISTORY_FRAMES", "MotionWindow", "Recorder"]
 

@@ -20,8 +20,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from data.interface.bodies import SIDES
 from sim.robots.build_solver import robot_kit
-from sim.robots.spec import SIDES, RobotSpec
+from sim.robots.spec import RobotSpec
 from sim.scene.catalogue import Catalogue, Part, load_catalogue
 from sim.scene.compiler import BASE_JOINTS, TIMESTEP_S, SceneKey, compile_scene
 from sim.scene.objects import (

@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 from transformers import AutoModelForImageTextToText
 
-from data.records import PlanStep
+from data.interface.steps import PlanStep
 from proprio_mllm.backends import local
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.local import LocalChat

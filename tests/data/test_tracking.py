@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from data.generator import generate_clip
-from data.records import Motion
+from data.interface.motion import Motion
 from data.retarget import Retargeter
 from data.skeleton import HumanMotion
 from data.tracking import Tracker, Tracking

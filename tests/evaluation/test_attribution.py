@@ -7,9 +7,11 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from data.records import Action, ActionKind, FailureCategory
+from data.interface.actions import ActionKind
+from data.interface.failures import FailureCategory, FailureCode
+from data.interface.feedback import category_of
+from data.interface.steps import Action
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, Deciding, attribute, deciding_failure, unmet_objects
-from sim.skills.failures import FailureCode, category_of
 from sim.tasks.task import load_benchmark
 
 

@@ -11,7 +11,8 @@ import pytest
 
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
-from data.records import EpisodeRecord, Observation, Outcome
+from data.interface.episode import EpisodeRecord, Outcome
+from data.interface.observation import Observation
 from proprio_mllm.evaluation.batching import AskingPlanner, Batcher, answer_all, batch_planner
 from proprio_mllm.evaluation.pool import run_side_by_side
 from proprio_mllm.evaluation.run import evaluate

@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from configs.schema.collect import CollectConfig
-from data.records import Observation, PlanStep
+from data.interface.observation import Observation
+from data.interface.steps import PlanStep
 from data.shards import ShardReader
 from proprio_mllm.evaluation import corrections
 from proprio_mllm.evaluation.dagger import collect_corrections

@@ -7,7 +7,8 @@ import json
 
 import pytest
 
-from data.records import FailureCategory, Outcome
+from data.interface.episode import Outcome
+from data.interface.failures import FailureCategory
 from proprio_mllm.evaluation.episode import run_episode
 from proprio_mllm.evaluation.ledger import Ledger, LedgerError, key_of, read_ledger, scored
 from proprio_mllm.evaluation.seeds import episode_seed, stream

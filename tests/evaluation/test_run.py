@@ -15,7 +15,7 @@ import pytest
 import configs
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
-from data.records import Outcome
+from data.interface.episode import Outcome
 from proprio_mllm.evaluation.ledger import Ledger, LedgerError, read_ledger
 from proprio_mllm.evaluation.run import evaluate, plan_episodes, run_folder, select_tasks, weights_digest
 from proprio_mllm.planners.protocol import WeightsError

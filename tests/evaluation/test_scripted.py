@@ -8,7 +8,10 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from data.records import ActionKind, FailureCategory, Outcome, PlanStep
+from data.interface.actions import ActionKind
+from data.interface.episode import Outcome
+from data.interface.failures import FailureCategory
+from data.interface.steps import PlanStep
 from proprio_mllm.evaluation.fault_injection import CAUSES, LATE_SLIPS, SLIPS, FaultyPlanner
 from proprio_mllm.evaluation.privileged import PrivilegedPlanner
 from proprio_mllm.evaluation.scripted import Cell, CellRunner, cells, drawn, read_plans

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from data.records import Camera
-from proprio_mllm.model.geometry import KEY_BODIES, arm_length_m, body_point_in_pelvis, centroid, project, unproject
+from data.interface.bodies import KEY_BODIES
+from data.interface.observation import Camera
+from proprio_mllm.model.geometry import arm_length_m, body_point_in_pelvis, centroid, project, unproject
 from proprio_mllm.model.mpe import MPE_MODES, SignEmbedding, degenerate, position_ids, relative_cells, visual_positions
 
 PAD = 9

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from data.records import HistoryItem, Observation, Proprioception
+from data.interface.observation import HistoryItem, Observation, Proprioception
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.observing import plan_example
 from proprio_mllm.model.vocabulary import motion_text

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from data.records import Action, HistoryItem, PlanStep
+from data.interface.observation import HistoryItem
+from data.interface.steps import Action, PlanStep
 from proprio_mllm.model import prompts, questions
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.chat import Message, encode, render, to_chat

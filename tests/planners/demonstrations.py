@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from data.records import PlanStep
+from data.interface.steps import PlanStep
 from data.shards import ShardWriter, encode_png
 
 FURNITURE = ("CounterTop_1", "Drawer_1", "Fridge_1", "LightSwitch_1")

@@ -16,7 +16,7 @@ from configs.schema.model import (
     TinyTextConfig,
     TinyVisionConfig,
 )
-from data.records import Camera, HistoryItem, Observation, Proprioception
+from data.interface.observation import Camera, HistoryItem, Observation, Proprioception
 from proprio_mllm.model.building import build_model, build_processor, save_model
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.planners.mllm import MllmPlanner

@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data.records import Feedback, Observation, PlanStep
+from data.interface.feedback import Feedback
+from data.interface.observation import Observation
+from data.interface.steps import PlanStep
 from proprio_mllm.backends.protocol import ChatRequest
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, GoalReport, RunnableSession, Stats, run_episode
 from proprio_mllm.evaluation.privileged import ExpertPlanner

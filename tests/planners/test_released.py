@@ -11,7 +11,7 @@ import pytest
 
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
-from data.records import Observation
+from data.interface.observation import Observation
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.mllm import MllmPlanner

@@ -11,8 +11,8 @@ import pytest
 from datasets import load_from_disk
 
 from data.files import file_hash
+from data.interface.steps import PlanStep
 from data.motion import N_FEATURES
-from data.records import PlanStep
 from data.shards import decode_motion
 from proprio_mllm.report.export import ExportConfig as Config
 from proprio_mllm.report.export import ExportError, export, main, read_sft, read_traces

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data.records import Outcome
+from data.interface.episode import Outcome
 from proprio_mllm.evaluation.ledger import Ledger
 from proprio_mllm.report.frames import act_out, episode_id
 from proprio_mllm.report.html import main, page, run_data

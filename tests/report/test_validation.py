@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from data.records import EpisodeRecord, FailureCategory, Outcome
+from data.interface.episode import EpisodeRecord, Outcome
+from data.interface.failures import FailureCategory
 from proprio_mllm.evaluation.scripted import Scripted, ScriptedResult
 from proprio_mllm.report import validation
 from proprio_mllm.report.validation import main, validate

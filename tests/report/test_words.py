@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from data.interface.failures import FAILURES, FailureCode
 from proprio_mllm.report.words import code_in_words, goal_in_words, margins_in_words
-from sim.skills.failures import FAILURES, FailureCode
 from sim.tasks.predicates import Predicate
 from sim.tasks.task import load_benchmark
 

@@ -17,7 +17,7 @@ from configs.compose import compose
 from configs.schema.model import ModelConfig
 from configs.schema.train import TrainConfig
 from configs.validate import ConfigError, build
-from data.records import Camera, Observation, Proprioception
+from data.interface.observation import Camera, Observation, Proprioception
 from data.shards import ShardError, ShardReader, ShardWriter
 from proprio_mllm.model.building import add_adapter, load_model
 from proprio_mllm.model.groups import train_only

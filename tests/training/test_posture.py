@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from data.interface.bodies import KEY_BODIES, SIDES
 from data.motion import HAND_OPENING, KEY_BODY_COUNT, N_FEATURES
 from proprio_mllm.training.posture import in_other_postures
-from sim.robots.spec import KEY_BODIES, SIDES
 
 BONES = [
     (f"{side}_{a}", f"{side}_{b}")

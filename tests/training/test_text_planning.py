@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from configs.schema.model import ModelConfig
+from data.interface.observation import HistoryItem
 from data.motion import HAND_OPENING
-from data.records import HistoryItem
 from data.shards import ShardWriter
 from proprio_mllm.training.sources import Bodies, Demos, Exercises
 from proprio_mllm.training.states import open_hands

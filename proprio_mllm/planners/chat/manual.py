@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from data.records import ACTIONS, ActionKind, ActionSpec
+from data.interface.actions import ACTIONS, ActionKind, ActionSpec
 from data.robot_facts import robot_facts
 
 __all__ = ["CODES", "DESCRIPTIONS", "action_manual", "code_manual", "role"]

@@ -11,7 +11,9 @@ from collections import deque
 
 import numpy as np
 
-from data.records import Feedback, Observation, PlanStep
+from data.interface.feedback import Feedback
+from data.interface.observation import Observation
+from data.interface.steps import PlanStep
 from proprio_mllm.backends.protocol import Backend, ChatImage
 from proprio_mllm.planners.chat.asking import Answer, Asker
 from proprio_mllm.planners.chat.manual import action_manual, code_manual, role

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from data.interface.bodies import KEY_BODIES
+from data.interface.observation import HistoryItem, Observation, Proprioception
 from data.motion import HAND_OPENING, OPEN_HAND, PELVIS_HEIGHT
-from data.records import HistoryItem, Observation, Proprioception
 from proprio_mllm.backends.protocol import ChatImage
-from proprio_mllm.model.geometry import KEY_BODIES
 
 __all__ = ["body_text", "encoded", "log_text", "scene_text"]
 

@@ -11,7 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from data.records import Action, ActionError, Arm, HistoryItem
+from data.interface.actions import Arm
+from data.interface.observation import HistoryItem
+from data.interface.steps import Action, ActionError
 
 __all__ = ["UNKNOWN", "Belief", "Event"]
 

@@ -9,7 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from data.records import Action, Observation
+from data.interface.observation import Observation
+from data.interface.steps import Action
 from proprio_mllm.planners.furniture import CONTAINERS, SEATS, SURFACES
 from proprio_mllm.planners.scripted.belief import Belief
 from proprio_mllm.planners.scripted.words import Mention, candidates, type_of

@@ -7,10 +7,11 @@ import io
 import numpy as np
 from PIL import Image
 
-from data.records import ACTIONS, HistoryItem
+from data.interface.actions import ACTIONS
+from data.interface.failures import FailureCode
+from data.interface.observation import HistoryItem
 from proprio_mllm.planners.chat.manual import CODES, DESCRIPTIONS, action_manual, code_manual, role
 from proprio_mllm.planners.chat.view import body_text, encoded, log_text, scene_text
-from sim.skills.failures import FailureCode
 from tests.planners.chat.script import observation
 
 

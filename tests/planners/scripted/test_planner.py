@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from configs.schema.robot import RobotConfig
-from data.records import Arm, Camera, HistoryItem, Observation, Outcome, Proprioception
+from data.interface.actions import Arm
+from data.interface.episode import Outcome
+from data.interface.observation import Camera, HistoryItem, Observation, Proprioception
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, run_episode
 from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.protocol import Planner, TaskInfo

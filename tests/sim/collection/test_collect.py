@@ -8,8 +8,9 @@ import pytest
 from configs.arguments import read_arguments
 from configs.schema.collect import CollectConfig
 from configs.validate import ConfigError
+from data.interface.actions import Arm
+from data.interface.steps import Action, PlanStep
 from data.motion import N_FEATURES
-from data.records import Action, Arm, PlanStep
 from data.shards import ShardReader, decode_depth, decode_png, decode_segmentation
 from sim.collection.collect import collect, main, parts_of, rows_of_part
 from sim.collection.demonstrations import perturbed, run_correction, run_episode

@@ -5,8 +5,8 @@ import pytest
 
 from configs.schema.data import ReplayConfig
 from data.generator import generate_clip
+from data.interface.motion import Motion
 from data.motion import decode_key_bodies, heading_to_world, world_to_heading
-from data.records import Motion
 from data.retarget import Retargeter
 from data.shards import decode_depth, decode_png
 from sim.collection.replay import picture_frames, place_path, replay_clip, set_frame

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from configs.schema.collect import CollectConfig
-from data.records import PlanStep
+from data.interface.steps import PlanStep
 from sim.collection.collect import rows_of_part
 from sim.collection.text_world import Exercise, corrections_of_part, play
 from sim.scene.catalogue import load_catalogue

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from data.records import Action, Arm
+from data.interface.actions import Arm
+from data.interface.steps import Action
 from sim.expert.expert import Expert
 from sim.expert.lookahead import Rehearsal
 from sim.session.session import Session

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data.records import Action, Arm
+from data.interface.actions import Arm
+from data.interface.steps import Action
 from sim.interfaces.controller import Controller
 from sim.interfaces.poses import random_placements
 from sim.world.world import World, WorldError

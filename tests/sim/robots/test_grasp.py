@@ -4,8 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from data.interface.bodies import SIDES
 from sim.robots.build_common import ROBOT_AFFINITY, ROBOT_BIT
-from sim.robots.spec import SIDES, available_robots, load_robot
+from sim.robots.spec import available_robots, load_robot
 
 
 def _fixed_robot(name: str) -> mujoco.MjSpec:

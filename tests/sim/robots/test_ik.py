@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from configs.validate import ConfigError
+from data.interface.bodies import SIDES
 from sim.robots.build_solver import SOLVERS, robot_kit
 from sim.robots.kinematics import root_quaternion
 from sim.robots.reach import reach_over_heights
 from sim.robots.solver import ReachTarget, rotation_from_axes
-from sim.robots.spec import SIDES, available_robots, load_robot
+from sim.robots.spec import available_robots, load_robot
 
 
 def _root(kit, height):

@@ -4,8 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from data.interface.bodies import KEY_BODIES
 from sim.robots.kinematics import RobotModel
-from sim.robots.spec import KEY_BODIES, available_robots, load_robot
+from sim.robots.spec import available_robots, load_robot
 
 CONFIGURATIONS = 100
 

@@ -6,11 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from data.interface.bodies import SIDES
 from sim.robots.build_solver import SOLVERS, robot_kit
 from sim.robots.kinematics import RobotModel
 from sim.robots.self_collision import SELF_TOUCH_M, OwnBody
 from sim.robots.solver import ReachTarget, rotation_from_axes
-from sim.robots.spec import SIDES, BodyShape, available_robots
+from sim.robots.spec import BodyShape, available_robots
 
 ROBOTS = available_robots()
 

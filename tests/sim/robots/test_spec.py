@@ -7,7 +7,8 @@ import pytest
 import yaml
 
 from configs.validate import ConfigError
-from sim.robots.spec import KEY_BODIES, SIDES, available_robots, load_robot
+from data.interface.bodies import KEY_BODIES, SIDES
+from sim.robots.spec import available_robots, load_robot
 
 SPECS = Path(load_robot("h1").mjcf_path).parents[2] / "specs"
 

@@ -11,7 +11,7 @@ from configs.assets import ASSETS_VARIABLE
 from configs.compose import compose
 from configs.schema.eval import EvalConfig
 from configs.validate import ConfigError, build
-from data.records import PlanStep
+from data.interface.steps import PlanStep
 from sim.robots.spec import available_robots, load_robot
 from sim.scene.catalogue import load_catalogue
 from sim.scene.rooms import load_room, room_names

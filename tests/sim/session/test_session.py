@@ -8,10 +8,11 @@ import pytest
 import yaml
 
 import sim.robots
-from data.records import Action, Arm, PlanStep
+from data.interface.actions import Arm
+from data.interface.failures import FailureCode
+from data.interface.steps import Action, PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
-from sim.skills.failures import FailureCode
 from sim.tasks.predicates import Predicate
 from sim.tasks.task import load_benchmark
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from data.records import Action, Arm, PlanStep
+from data.interface.actions import Arm
+from data.interface.steps import Action, PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 from sim.skills.articulate import assess_open_close

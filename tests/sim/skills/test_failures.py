@@ -1,26 +1,10 @@
-"""Failure codes: the table is complete, and outcomes carry code, category and margins."""
+"""How skills end: outcomes carry code, category and margins."""
 
 import pytest
 
-from data.records import Action, FailureCategory
-from sim.skills.failures import FAILURES, FailureCode, SkillFailure, category_of, failed, succeeded
-
-
-def test_every_code_has_a_meaning():
-    assert set(FAILURES) == set(FailureCode)
-    assert all(spec.meaning for spec in FAILURES.values())
-
-
-@pytest.mark.parametrize(
-    ("text", "category"),
-    [
-        ("MoveAhead(0.5)", FailureCategory.NAVIGATION),
-        ("MoveDown(0.1)", FailureCategory.BODY_ADJUSTMENT),
-        ("Pick(left, Mug_1)", FailureCategory.LOGICAL),
-    ],
-)
-def test_contingencies_take_the_category_of_their_action(text, category):
-    assert category_of(FailureCode.NOTHING_HAPPENED, Action.parse(text)) is category
+from data.interface.failures import FailureCategory, FailureCode
+from data.interface.steps import Action
+from sim.skills.failures import SkillFailure, failed, succeeded
 
 
 def test_outcome_of_a_failure():

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from data.records import PlanStep
+from data.interface.steps import PlanStep
 from sim.robots.spec import load_robot
 from sim.scene.catalogue import load_catalogue
 from sim.scene.compiler import build_type_spec

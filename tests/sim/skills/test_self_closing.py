@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from data.records import Action, PlanStep
+from data.interface.steps import Action, PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 from sim.world.world import World, WorldError

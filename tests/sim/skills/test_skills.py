@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 
-from data.records import Action, Arm, FailureCategory, PlanStep
+from data.interface.actions import Arm
+from data.interface.failures import FailureCategory, FailureCode
+from data.interface.steps import Action, PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 from sim.skills.articulate import assess_open_close
 from sim.skills.body import Body
-from sim.skills.failures import FailureCode, SkillFailure
+from sim.skills.failures import SkillFailure
 from sim.skills.navigation import Stance
 from sim.skills.plan_cache import remembered
 from sim.skills.push import Push

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from data.records import Feedback, PlanStep
+from data.interface.feedback import Feedback
+from data.interface.steps import PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 from sim.world.liquids import balance_l, capacity_l

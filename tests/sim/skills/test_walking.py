@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data.records import Arm, FailureCategory, PlanStep
+from data.interface.actions import Arm
+from data.interface.failures import FailureCategory
+from data.interface.steps import PlanStep
 from sim.robots.build_solver import robot_kit
 from sim.robots.kinematics import root_quaternion
 from sim.session.session import FreePlay, Session

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections import Counter
 
-from data.records import Arm, Observation
+from data.interface.actions import Arm
+from data.interface.observation import Observation
 from proprio_mllm.planners.chat.dag_plan.hands import ARMS, Hands
 from proprio_mllm.planners.scripted.belief import Belief
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from data.records import Feedback, Observation
+from data.interface.feedback import Feedback
+from data.interface.observation import Observation
 from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.chat.reflection import Seen, changed_text, completed_steps, failed_text
 from proprio_mllm.planners.chat.view import scene_text

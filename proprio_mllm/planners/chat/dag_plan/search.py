@@ -11,7 +11,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Final
 
-from data.records import Action, Arm
+from data.interface.actions import Arm
+from data.interface.steps import Action
 from proprio_mllm.planners.furniture import CONTAINERS, SEATS, SURFACES
 from proprio_mllm.planners.scripted.belief import Belief
 from proprio_mllm.planners.scripted.words import candidates, find_mentions, type_of

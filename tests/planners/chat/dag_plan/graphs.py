@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from data.records import ActionKind, Arm
+from data.interface.actions import ActionKind, Arm
 from proprio_mllm.planners.chat.dag_plan.checks import KINDS, check_graph
 from proprio_mllm.planners.chat.dag_plan.graph import Graph, NodeReply
 from proprio_mllm.planners.chat.dag_plan.hands import EMPTY, Hands, after

@@ -2,7 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from data.records import ACTIONS, Action, ActionError, ActionOutcome, Arm, Feedback, PlanStep
+from data.interface.actions import ACTIONS, Arm
+from data.interface.feedback import ActionOutcome, Feedback
+from data.interface.steps import Action, ActionError, PlanStep
 
 
 @pytest.mark.parametrize(

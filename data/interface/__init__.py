@@ -1,0 +1,1 @@
+"""Contracts between simulator, training data and planners; numpy and the standard library alone."""
