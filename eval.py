@@ -15,38 +15,25 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 from rich.console import Console
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from configs.compose import compose
-from configs.help import asks_for_help, help_text
+from configs.app import run_app
 from configs.schema.eval import EvalConfig
-from configs.validate import ConfigError, build
 
 __all__ = ["main"]
 
 
-def main(overrides: Sequence[str]) -> int:
-    """Runs the command line.
-
-    Args:
-        overrides: `key=value` pairs of `configs/eval.yaml`.
+def run(cfg: EvalConfig) -> int:
+    """Runs one configuration.
 
     Returns:
         0; 1 when episodes stay without a score, weights, a package or a backend are absent, a file cannot be written, or a
-        table cannot be assembled; 2 on a wrong key, value or ledger.
+        table cannot be assembled; 2 on a value or a ledger that is not allowed.
     """
-    if asks_for_help(overrides):
-        sys.stdout.write(help_text("eval", EvalConfig, __doc__ or ""))
-        return 0
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     for name in ("httpx2", "OpenGL"):  # a line per call would drown the progress bar; that acceleration is absent is no news
         logging.getLogger(name).setLevel(logging.WARNING)
     console = Console(stderr=True, highlight=False)
-    try:
-        cfg = build(EvalConfig, compose("eval", overrides))
-    except ConfigError as error:
-        console.print(f"eval.py: {error}", style="red", markup=False, soft_wrap=True)
-        return 2
     from proprio_mllm.backends.protocol import BackendError
-    from proprio_mllm.evaluation.run import evaluate  # loads the simulator; a typo above stops before that
+    from proprio_mllm.evaluation.run import evaluate  # loads the simulator; a typo stops before that
     from proprio_mllm.planners.chat.embedding import EmbeddingError
     from proprio_mllm.planners.protocol import WeightsError
     from proprio_mllm.report.experiments import assemble
@@ -79,5 +66,10 @@ def main(overrides: Sequence[str]) -> int:
     return 0 if run.complete else 1
 
 
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line of Hydra; returns the exit code, see `run`, or 2 on a wrong key or value."""
+    return run_app("eval", EvalConfig, run, __doc__ or "", arguments)
+
+
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

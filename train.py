@@ -15,10 +15,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
-from configs.compose import compose
-from configs.help import asks_for_help, help_text
+from configs.app import run_app
 from configs.schema.train import TrainConfig
-from configs.validate import ConfigError, build
 
 logger = logging.getLogger("train")
 
@@ -116,19 +114,11 @@ def _corrections(*args: Any, **kwargs: Any) -> Any:
     return collect_corrections(*args, **kwargs)
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Command line; 0 on success, 1 when an input is missing, 2 on a configuration that is not allowed."""
-    if asks_for_help(arguments):
-        sys.stdout.write(help_text("train", TrainConfig, __doc__ or ""))
-        return 0
+def job(cfg: TrainConfig) -> int:
+    """Runs one configuration; 0 on success, 1 when an input is missing."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     for noisy in ("httpx", "datasets", "filelock", "OpenGL"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
-    try:
-        cfg = build(TrainConfig, compose("train", arguments))
-    except ConfigError as error:
-        sys.stderr.write(f"train.py: {error}\n")
-        return 2
     from data.humanml3d import DatasetError
     from data.shards import ShardError
     from proprio_mllm.training.pipeline import StageError
@@ -141,8 +131,13 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line of Hydra; returns the exit code, see `job`, or 2 on a wrong key or value."""
+    return run_app("train", TrainConfig, job, __doc__ or "", arguments)
+
+
 if __name__ == "__main__":
     os.environ.setdefault("MUJOCO_GL", "egl")
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads double the cost where cores are shared
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

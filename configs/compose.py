@@ -1,7 +1,8 @@
-"""Composes the YAML groups with command-line overrides into one plain mapping, through Hydra.
+"""Composes the YAML groups with overrides through Hydra, and says what is wrong with overrides that do not compose.
 
-The entry points call `compose` and hand the result to `configs.validate.build`; nothing else in the project knows Hydra. A
-wrong group value or key stops here with the allowed ones; a wrong value of a plain key stops in `build`.
+`configs.app` runs the entry points as Hydra applications; `compose` is the same composition for tests, notebooks and
+benchmarks. Both hand a plain mapping to `configs.validate.build`; library code never sees Hydra. Robots of the user's own
+assets are offered beside those of `configs/robot`.
 """
 
 from __future__ import annotations
@@ -15,18 +16,21 @@ from typing import Any
 import yaml
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from configs.assets import own_files
-from configs.validate import ConfigError
+from configs.validate import ConfigError, allowed_values
 
-__all__ = ["CONFIG_DIR", "compose", "group_file", "groups"]
+__all__ = ["COMPOSITION_ERRORS", "CONFIG_DIR", "compose", "explain", "group_file", "groups", "open_fields", "register"]
 
 CONFIG_DIR = Path(__file__).resolve().parent
-#: Of these groups fields can be set that the group's file leaves at their defaults.
+#: What Hydra raises when overrides do not compose.
+COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException)
+#: Groups whose fields may be set although the group's file leaves them at the schema's defaults.
 _OPEN = ("backend.", "planner.")
 
 
@@ -47,6 +51,27 @@ def group_file(group: str, name: str) -> dict[str, Any]:
     return yaml.safe_load(path.read_text(encoding="utf-8")) if name.isidentifier() and path.is_file() else {}
 
 
+def register(help_text: str = "") -> None:
+    """Adds to Hydra's groups what no file of `configs/` holds: the user's own robots, and the text of `--help`."""
+    store = ConfigStore.instance().store
+    for name, path in own_files("robots").items():
+        store(group="robot", name=name, node={"name": name, "spec": str(path), "mjcf": None})
+    node = {"app_name": "", "header": "", "footer": "", "template": help_text.replace("$", "$$")}
+    store(group="hydra/help", name="fields", node=node)
+
+
+def open_fields(overrides: Sequence[str]) -> list[str]:
+    """Overrides that may set what a group's file leaves at its default; the schema refuses fields that do not exist.
+
+    Raises:
+        ConfigError: on an override without a key.
+    """
+    for override in overrides:
+        if not override.partition("=")[0].strip("+~"):
+            raise ConfigError(f"override {override!r}: expected key=value")
+    return [f"++{override}" if override.startswith(_OPEN) else override for override in overrides]
+
+
 def compose(root: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
     """Composes `configs/<root>.yaml` with overrides such as `robot=x1` or `trials=3`.
 
@@ -61,78 +86,65 @@ def compose(root: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
         ConfigError: on a malformed override, an unknown group, group value or key; the message lists what is allowed.
     """
     if not (CONFIG_DIR / f"{root}.yaml").is_file():
-        allowed = ", ".join(sorted(path.stem for path in CONFIG_DIR.glob("*.yaml")))
-        raise ConfigError(f"no root config {root!r}; allowed: {allowed}")
-    _check_groups(overrides)
-    overrides = _add_fields(_name_own_robots(overrides))
+        roots = sorted(path.stem for path in CONFIG_DIR.glob("*.yaml"))
+        raise ConfigError(f"no root config {root!r}; {allowed_values(root, roots)}")
+    register()
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(config_dir=str(CONFIG_DIR), version_base=None):
-            config = hydra_compose(config_name=root, overrides=list(overrides))
+            config = hydra_compose(config_name=root, overrides=open_fields(overrides))
             values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(_explain(error, root, overrides)) from error
+    except COMPOSITION_ERRORS as error:
+        raise ConfigError(explain(error, root, overrides)) from error
     if not isinstance(values, dict):
         raise ConfigError(f"configs/{root}.yaml: expected a mapping, got {type(values).__name__}")
     return {str(key): value for key, value in values.items()}
 
 
-def _name_own_robots(overrides: Sequence[str]) -> list[str]:
-    """Spells `robot=NAME` out for a robot of the user's own assets, which has no file in `configs/robot`."""
-    own = own_files("robots")
-    spelled: list[str] = []
-    for override in overrides:
-        key, _, value = override.partition("=")
-        if key.lstrip("+") == "robot" and value in own:
-            spelled += [f"robot={groups()['robot'][0]}", f"robot.name={value}", f"robot.spec='{own[value]}'"]
-        else:
-            spelled.append(override)
-    return spelled
+def explain(error: Exception, root: str, overrides: Sequence[str]) -> str:
+    """What is wrong with overrides that did not compose, with what is allowed.
 
-
-def _add_fields(overrides: Sequence[str]) -> list[str]:
-    """Lets fields be set that a group's file leaves at their defaults; `build` refuses those that do not exist."""
-    return [f"++{override}" if override.startswith(_OPEN) else override for override in overrides]
-
-
-def _check_groups(overrides: Sequence[str]) -> None:
-    known = groups()
-    known["robot"] = (*known["robot"], *own_files("robots"))
+    Args:
+        error: one of `COMPOSITION_ERRORS`.
+        root: name of the root file.
+        overrides: as the user gave them.
+    """
+    known = groups() | {"robot": (*groups()["robot"], *own_files("robots"))}
     for override in overrides:
         key, sep, value = override.partition("=")
-        if not key.strip("+~") or (not sep and not key.startswith("~")):
-            raise ConfigError(f"override {override!r}: expected key=value")
+        if not sep and not key.startswith("~"):
+            return f"override {override!r}: expected key=value"
         name = key.lstrip("+")
-        if name in known and value not in known[name]:
-            raise ConfigError(f"{name}={value!r} is not allowed; allowed: {', '.join(known[name])}")
-
-
-def _explain(error: Exception, root: str, overrides: Sequence[str]) -> str:
+        wrong = [one for one in value.split(",") if one not in known.get(name, (one,))]
+        if wrong and isinstance(error, HydraException):
+            return f"{name}={wrong[0]!r} is not allowed; {allowed_values(wrong[0], known[name])}"
     if isinstance(error, MissingMandatoryValue) and error.full_key:
         return _missing(str(error.full_key), overrides)
+    if isinstance(error, OverrideParseException):
+        override = str(error.override).removeprefix("++")
+        quoted = "\"key='value'\""  # for Hydra, and for the shell
+        return f"override {override!r} cannot be read; a value with ()[]{{}}=~ or letters outside ASCII needs quotes: {quoted}"
+    return _unknown_key(root, overrides) or _first_line(error)
+
+
+def _unknown_key(root: str, overrides: Sequence[str]) -> str:
+    """The first key among the overrides that the configuration does not have."""
     GlobalHydra.instance().clear()
     with initialize_config_dir(config_dir=str(CONFIG_DIR), version_base=None):
-        try:
-            config = hydra_compose(config_name=root)
-        except (HydraException, OmegaConfBaseException):
-            return f"configs/{root}.yaml does not compose: {_first_line(error)}"
+        config = hydra_compose(config_name=root)
     for override in overrides:
         key = override.partition("=")[0].lstrip("+~")
-        if key in groups() or key.startswith(_OPEN):
+        if key in groups() or key.startswith((*_OPEN, "hydra")):
             continue
         node: Any = config
         path: list[str] = []
         for part in key.split("."):
             if not isinstance(node, DictConfig) or part not in node:
-                allowed = ", ".join(sorted(str(k) for k in node)) if isinstance(node, DictConfig) else "none"
-                return f"{'.'.join([*path, part])}: unknown key in {override!r}; allowed: {allowed}"
+                options = sorted(str(k) for k in node) if isinstance(node, DictConfig) else []
+                return f"{'.'.join([*path, part])}: unknown key in {override!r}; {allowed_values(part, options)}"
             path.append(part)
             node = node[part] if not OmegaConf.is_missing(node, part) else None
-    if isinstance(error, OverrideParseException):
-        override = str(error.override).removeprefix("++")
-        quoted = "\"key='value'\""  # for Hydra, and for the shell
-        return f"override {override!r} cannot be read; a value with ()[]{{}}=~ or letters outside ASCII needs quotes: {quoted}"
-    return _first_line(error)
+    return ""
 
 
 def _missing(key: str, overrides: Sequence[str]) -> str:

@@ -49,7 +49,7 @@ def help_text(root: str, schema: type, about: str) -> str:
     values = compose(root)
     lines = [*textwrap.dedent(about).strip().splitlines(), "", "Groups (`group=value`):", ""]
     defaults = yaml.safe_load((CONFIG_DIR / f"{root}.yaml").read_text(encoding="utf-8"))["defaults"]
-    for name in (name for entry in defaults if isinstance(entry, dict) for name in entry):
+    for name in (name for entry in defaults if isinstance(entry, dict) for name in entry if name in groups()):
         lines += _entry(name, ", ".join(groups()[name]), 2, 16)
     lines += ["", "Fields (`field=value`; of a group `group.field=value`) and their defaults:", ""]
     for name, default, meaning in _fields(schema, values, ""):

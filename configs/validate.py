@@ -7,19 +7,27 @@ offending entry and the allowed ones.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import types
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-__all__ = ["ConfigError", "build"]
+__all__ = ["ConfigError", "allowed_values", "build"]
 
 T = TypeVar("T")
 
 
 class ConfigError(ValueError):
     """A configuration entry that is not allowed; the message names its path, its value and what is allowed."""
+
+
+def allowed_values(value: object, allowed: Iterable[object]) -> str:
+    """The second half of a message that refuses a value: what is allowed, and the nearest of it to what was given."""
+    names = [str(name) for name in allowed]
+    near = difflib.get_close_matches(str(value), names, n=1, cutoff=0.6)
+    return f"allowed: {', '.join(names) or 'none'}" + (f"; did you mean {near[0]!r}?" if near else "")
 
 
 def build(cls: type[T], values: Mapping[str, Any], where: str = "") -> T:
@@ -40,7 +48,7 @@ def build(cls: type[T], values: Mapping[str, Any], where: str = "") -> T:
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     unknown = [key for key in values if key not in fields]
     if unknown:
-        raise ConfigError(f"{_at(where, str(unknown[0]))}: unknown key; allowed: {', '.join(sorted(fields))}")
+        raise ConfigError(f"{_at(where, str(unknown[0]))}: unknown key; {allowed_values(unknown[0], sorted(fields))}")
     hints = get_type_hints(cls)
     kwargs: dict[str, Any] = {}
     for name, f in fields.items():
@@ -68,7 +76,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         allowed = get_args(hint)
         # YAML 1.1 reads on/off/yes/no as booleans.
         if value not in allowed or isinstance(value, bool) != isinstance(allowed[0], bool):
-            raise ConfigError(f"{where}: {value!r} is not allowed; allowed: {', '.join(map(str, allowed))}")
+            raise ConfigError(f"{where}: {value!r} is not allowed; {allowed_values(value, allowed)}")
         return value
     if origin in (Union, types.UnionType):
         options = get_args(hint)
@@ -108,8 +116,8 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
             try:
                 return hint(value)
             except ValueError:
-                allowed_values = ", ".join(str(member.value) for member in hint)
-                raise ConfigError(f"{where}: {value!r} is not allowed; allowed: {allowed_values}") from None
+                members = [member.value for member in hint]
+                raise ConfigError(f"{where}: {value!r} is not allowed; {allowed_values(value, members)}") from None
         if hint is Path and isinstance(value, (str, Path)):
             return Path(value)
         if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):

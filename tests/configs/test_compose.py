@@ -64,7 +64,7 @@ def test_every_yaml_composes(path: Path) -> None:
         ("train", "model.mpe.mode=none", r"model\.mpe: mode|model\.mpe\.mode: 'none' is not allowed; allowed: mrope"),
         ("eval", "planner=oracle", r"planner='oracle' is not allowed; allowed: base, dag_plan, expert"),
         ("eval", "robot=atlas", r"robot='atlas' is not allowed; allowed: h1, x1"),
-        ("eval", "backend=null", r"backend='null' is not allowed; allowed: gemini, gpt4o"),
+        ("eval", "backend=none", r"backend='none' is not allowed; allowed: gemini, gpt4o"),
         ("eval", "backend=vllm", r"backend\.model has no value; set backend\.model=… \(vllm: .*give the name"),
         ("eval", "planner=qwen2_5_vl", r"backend\.model has no value; set .* \(qwen2_5_vl: .*backend\.model=FOLDER"),
         ("eval", "backend=serve", r"backend 'serve' with planner kind 'mllm', which asks none; allowed: none, or a planner of"),
