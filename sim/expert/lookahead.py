@@ -65,7 +65,7 @@ class Rehearsal:
         with self._in_thought():
             for candidate in self._heights(actions, stance, height):
                 self._put(stance, candidate)
-                if any(self._session.assess(action) is None for action in actions):
+                if any(self._session.assess(action, diagnose=False) is None for action in actions):
                     return True
         return False
 
@@ -75,20 +75,18 @@ class Rehearsal:
             hopeful = [(h, pair) for h in self.heights_m() for pair in pairs if all(self._within(a, stance, h) for a in pair)]
             for height, pair in hopeful[:_TOGETHER]:
                 self._put(stance, height)
-                if all(self._session.assess(action) is None for action in pair):
+                if all(self._session.assess(action, diagnose=False) is None for action in pair):
                     return True
         return False
 
     @contextmanager
     def _in_thought(self) -> Iterator[None]:
-        """What is moved inside stands where it was at the end, and the body plans in a hurry meanwhile."""
-        world, body = self._session.world, self._session.body
+        """What is moved inside is where it was at the end."""
+        world = self._session.world
         saved = world.save()
-        body.hurried = True
         try:
             yield
         finally:
-            body.hurried = False
             world.restore(saved)
 
     def _within(self, action: Action, stance: Stance, height_m: float) -> bool:
@@ -110,13 +108,13 @@ class Rehearsal:
         """
         with self._in_thought():
             self._put(stance, height_m)
-            if self._session.assess(first) is not None:
+            if self._session.assess(first, diagnose=False) is not None:
                 return False
             if first.name != "Open" or first.object_id is None:
                 return True
             self._pull_open(first.object_id)
             known = {*self._session.known_objects, first.object_id, then.object_id or first.object_id}
-            return assess_action(self._session.body, then, frozenset(known)) is None
+            return assess_action(self._session.body.assuming(diagnose=False), then, frozenset(known)) is None
 
     def _pull_open(self, object_id: str) -> None:
         """Puts a door or a drawer wide open; what lies in a drawer comes along."""
@@ -147,14 +145,11 @@ class Rehearsal:
             if stance is not None or height_m is not None:
                 base = session.body.commanded_base() if stance is None else stance
                 self._put(base, session.body.pelvis_height_m if height_m is None else height_m)
-            session.body.hurried = True
-            try:
-                if session.assess(first) is not None:
-                    return False
-                _, feedback = session.step(PlanStep((first,)))  # it also looks: what was shut away is known afterwards
-                return feedback.outcomes[0].success and session.assess(then) is None
-            finally:
-                session.body.hurried = False
+            if session.assess(first, diagnose=False) is not None:
+                return False
+            # it also looks: what was shut away is known afterwards
+            _, feedback = session.step(PlanStep((first,)), diagnose=False)
+            return feedback.outcomes[0].success and session.assess(then, diagnose=False) is None
 
     def heights_m(self) -> list[float]:
         """Pelvis heights worth trying, the present one first, then the nearest."""

@@ -216,16 +216,20 @@ class Session:
         self._seen, self._history, self._ended, self._opened = set(), [], False, True
         return self.observation()
 
-    def step(self, step: PlanStep) -> tuple[Observation, Feedback]:
+    def step(self, step: PlanStep, diagnose: bool = True) -> tuple[Observation, Feedback]:
         """Acts a plan step out in physics and looks around.
+
+        Args:
+            step: what is done.
+            diagnose: whether a refusal says what is wrong, see `Hypothesis`.
 
         Raises:
             RuntimeError: before `reset`, or after Done.
         """
-        feedback = self.act(step)
+        feedback = self.act(step, diagnose)
         return self.observation(), feedback
 
-    def act(self, step: PlanStep) -> Feedback:
+    def act(self, step: PlanStep, diagnose: bool = True) -> Feedback:
         """As `step`, without looking around afterwards; what came into view meanwhile stays unknown.
 
         Raises:
@@ -238,7 +242,7 @@ class Session:
             outcomes: tuple[ActionOutcome, ...] = tuple(ActionOutcome(action, True) for action in step.actions)
             feedback = Feedback(outcomes, 0.0)
         else:
-            feedback = self._run(step)
+            feedback = self._run(step, diagnose)
         arms = sum(2 if a.spec.kind is ActionKind.TWO_ARM else int(a.spec.kind is ActionKind.ARM) for a in step.actions)
         self.stats = dataclasses.replace(
             self.stats,
@@ -250,9 +254,9 @@ class Session:
         self._history.append(HistoryItem(step.to_text(), feedback.to_text()))
         return feedback
 
-    def _run(self, step: PlanStep) -> Feedback:
+    def _run(self, step: PlanStep, diagnose: bool) -> Feedback:
         started = self.world.time_s
-        skills = skills_for(self.body, step, frozenset(self.known_objects), self.draw)
+        skills = skills_for(self.body.assuming(diagnose=diagnose), step, frozenset(self.known_objects), self.draw)
         place = self.body.base().position
         path, text = 0.0, step.to_text()
 
@@ -290,9 +294,9 @@ class Session:
         state = {name: getattr(thing.state, name) for name in ("isFilledWithLiquid", "isToggled", "isDirty", "isBroken")}
         return self._luck.draw(self.stats.steps, action.name, object_id, thing.type.name, state)
 
-    def assess(self, action: Action) -> SkillFailure | None:
+    def assess(self, action: Action, diagnose: bool = True) -> SkillFailure | None:
         """Why an action would be refused right now, None when it would be tried. Moves nothing; for the privileged expert."""
-        return assess_action(self.body, action, frozenset(self.known_objects))
+        return assess_action(self.body.assuming(diagnose=diagnose), action, frozenset(self.known_objects))
 
     def teleport(self, x_m: float, y_m: float, yaw_rad: float, pelvis_height_m: float | None = None) -> None:
         """Puts the base somewhere at once, and what the hands hold with it; the pelvis height stays when it is None.

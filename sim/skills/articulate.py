@@ -28,9 +28,9 @@ from sim.skills.lids import closed_on, led_on, plan_lead, plan_tab
 from sim.skills.locomotion import sweep
 from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
 from sim.skills.navigation import Stance
-from sim.skills.plan_cache import remembered
+from sim.skills.plan_cache import cached_plan
 from sim.skills.push import Push, plan_push, push_shut
-from sim.skills.reach import Reach, explained, fulfils, plan_reach, route
+from sim.skills.reach import Reach, diagnosed, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import Skill
 
@@ -123,7 +123,7 @@ def _to_bar(body: Body, arm: Arm, wish: HandPose, bar: Sequence[int]) -> Reach |
     return plan_reach(body, arm, wish, -wish.pointing, 0.08, bar, pointing=0.7, closing=0.7)
 
 
-@remembered
+@cached_plan
 def assess_open_close(body: Body, action: Action) -> Pull | Push:
     """What Open or Close would do.
 
@@ -139,7 +139,7 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
     goal = low + (_OPEN_TO if opening else -0.04) * (high - low)  # shut means pushed against the stop
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
 
-    def lid(enough: int) -> Pull:
+    def lid(body: Body, enough: int) -> Pull:
         positions = np.linspace(float(body.world.data.qpos[part.qpos_adr]), goal, _WAYPOINTS)
         lead = plan_lead(
             body, arm, lambda q: carried_point(body, part, handle, q), positions, _pointings(body, arm, handle), bar, enough
@@ -148,11 +148,11 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
             raise SkillFailure(FailureCode.OBSTRUCTED)
         return Pull(lead.reach, part, positions[: len(lead.postures)], lead.postures, lead.back_m, lead.opening, lead.closed)
 
-    def whole_lid() -> Pull:
+    def whole_lid(body: Body) -> Pull:
         shares = (np.linspace(float(body.world.data.qpos[part.qpos_adr]), goal, _WAYPOINTS) - low) / (high - low)
-        return lid(1 + int(np.argmax(shares > _OPEN_MIN + 0.05 if opening else shares < 0.02)))
+        return lid(body, 1 + int(np.argmax(shares > _OPEN_MIN + 0.05 if opening else shares < 0.02)))
 
-    def search() -> Pull | Push:
+    def search(body: Body) -> Pull | Push:
         if not opening:
             push = plan_push(body, arm, thing, part)
             if push is not None:
@@ -174,15 +174,15 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
         return best
 
     if not part.spec.is_lid:
-        return explained(body, {arm: handle}, search)
+        return diagnosed(body, {arm: handle}, search)
     try:
-        return explained(body, {arm: handle}, whole_lid)
+        return diagnosed(body, {arm: handle}, whole_lid)
     except SkillFailure as failure:
         other_height = failure.code in (FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW)
-        if opening or thing.movable or other_height or body.hurried:
+        if opening or thing.movable or other_height or not body.hypothesis.diagnose:
             raise
         try:
-            return lid(_PART_WAY)  # the lid of a fixture stays where it is left, and is taken again from there
+            return lid(body, _PART_WAY)  # the lid of a fixture stays where it is left, and is taken again from there
         except SkillFailure:
             raise failure from None
 
@@ -196,7 +196,7 @@ def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
     handle = body.world.handle(thing.object_id)
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
 
-    def search() -> Reach:
+    def search(body: Body) -> Reach:
         if thing.moving[0].spec.is_lid:
             reach = plan_tab(body, arm, handle, _pointings(body, arm, handle), bar)
             if reach is not None:
@@ -208,7 +208,7 @@ def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
                 return reach
         raise SkillFailure(FailureCode.OBSTRUCTED)
 
-    return explained(body, {arm: handle}, search)
+    return diagnosed(body, {arm: handle}, search)
 
 
 def _plan_pull(body: Body, arm: Arm, part: MovingPart, reach: Reach, hand: Array, goal: float, opening: bool) -> Pull | None:
@@ -366,7 +366,7 @@ def _leave(body: Body, arm: Arm, reach: Reach, ignore: tuple[str, ...]) -> Skill
     yield from stow(body, arm, ignore)
 
 
-@remembered
+@cached_plan
 def assess_toggle(body: Body, action: Action) -> Reach:
     """What ToggleOn or ToggleOff would do.
 
@@ -387,7 +387,7 @@ def plan_press(body: Body, arm: Arm, point: Array, ignore: tuple[str, ...]) -> R
     """
     ahead, aside, opening = body.spec.hand.press
 
-    def search() -> Reach:
+    def search(body: Body) -> Reach:
         for pointing in _pointings(body, arm, point):
             first = body.solve(arm, HandPose(point - ahead * pointing, pointing))
             if not fulfils(first, pointing=0.8):
@@ -400,7 +400,7 @@ def plan_press(body: Body, arm: Arm, point: Array, ignore: tuple[str, ...]) -> R
                 return reach
         raise SkillFailure(FailureCode.OBSTRUCTED)
 
-    return explained(body, {arm: point}, search)
+    return diagnosed(body, {arm: point}, search)
 
 
 def toggle(body: Body, action: Action, luck: Luck) -> Skill:

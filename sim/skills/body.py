@@ -11,9 +11,9 @@ Frames: `world`; `pelvis` is the pelvis heading frame.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Final
@@ -33,6 +33,7 @@ from sim.scene.objects import ObjectInstance
 from sim.skills.clearance import ClearanceProbe
 from sim.skills.footsteps import footsteps
 from sim.skills.gait import leg_motion
+from sim.skills.hypothesis import Hypothesis
 from sim.skills.navigation import NavigationMap, Stance
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach_map import WOUND_RAD, HandPose, ReachMap, reach_maps
@@ -140,10 +141,7 @@ class Body:
         self._hand_scale = np.where(sliding, 0.2, 1.0)
         self._mine = np.where(np.isin(model.geom_bodyid, list(world.robot_body_ids)), 1, -1)
         self._columns = {arm: kit.model.indices(self.spec.arms[arm.value].joints) for arm in Arm}
-        self.considered_height_m: float | None = None
-        self.considered_stance: Stance | None = None
-        #: Whether a refusal may stay unexplained: no other pelvis heights are tried to find its reason.
-        self.hurried = False
+        self.hypothesis = Hypothesis()
         self._vias: dict[Arm, tuple[Array, ...]] = {}
         self.plans = Plans()
         self.probe = ClearanceProbe(world, self)
@@ -156,7 +154,26 @@ class Body:
             for thing in self.world.objects.values()
         )
         numbers = (data.qpos.tobytes(), data.ctrl.tobytes(), data.xpos.tobytes())
-        return *numbers, things, self.considered_height_m, self.considered_stance, self.hurried
+        return *numbers, things, self.hypothesis
+
+    def assuming(
+        self, stance: Stance | None = None, pelvis_height_m: float | None = None, diagnose: bool | None = None
+    ) -> Body:
+        """This body under a hypothesis: what it answers holds for another stance or height, and nothing moves.
+
+        Args:
+            stance: assumed stance; None keeps what is assumed or commanded already.
+            pelvis_height_m: assumed pelvis height, metres; None likewise.
+            diagnose: whether refusals say what is wrong; None likewise.
+        """
+        now, there = self.hypothesis, copy.copy(self)
+        there.hypothesis = Hypothesis(
+            now.stance if stance is None else stance,
+            now.pelvis_height_m if pelvis_height_m is None else pelvis_height_m,
+            now.diagnose if diagnose is None else diagnose,
+        )
+        there.probe = self.probe.assuming(there)
+        return there
 
     # ---- base and legs
 
@@ -166,36 +183,17 @@ class Body:
         return Stance(float(x), float(y), float(yaw))
 
     def commanded_base(self) -> Stance:
-        """Where the base is told to be, or the stance that is being considered."""
-        if self.considered_stance is not None:
-            return self.considered_stance
+        """Where the base is told to be, or is assumed to be."""
+        if self.hypothesis.stance is not None:
+            return self.hypothesis.stance
         x, y, _, yaw = self.world.data.ctrl[self._base[:4]]
         return Stance(float(x), float(y), float(yaw))
 
     @property
     def pelvis_height_m(self) -> float:
-        """Commanded pelvis height, or the one that is being considered."""
-        return self.considered_height_m if self.considered_height_m is not None else float(self.world.data.ctrl[self._base[2]])
-
-    @contextmanager
-    def considering(self, pelvis_height_m: float) -> Iterator[None]:
-        """Within the block every geometric answer is for another pelvis height; nothing moves."""
-        before = self.considered_height_m
-        self.considered_height_m = pelvis_height_m
-        try:
-            yield
-        finally:
-            self.considered_height_m = before
-
-    @contextmanager
-    def considering_stance(self, stance: Stance) -> Iterator[None]:
-        """Within the block every geometric answer is for another stance; nothing moves."""
-        before = self.considered_stance
-        self.considered_stance = stance
-        try:
-            yield
-        finally:
-            self.considered_stance = before
+        """Commanded pelvis height, or the assumed one."""
+        assumed = self.hypothesis.pelvis_height_m
+        return float(self.world.data.ctrl[self._base[2]]) if assumed is None else assumed
 
     def base_error_m(self) -> float:
         """Distance between commanded and actual base, the heading weighed with 0.3 m per radian."""
@@ -237,8 +235,8 @@ class Body:
 
     def fits(self, stance: Stance) -> bool:
         """Whether arms and hands, as they are commanded, would touch nothing at a stance."""
-        with self.considering_stance(stance):
-            return all(self.probe.free(arm, [self.commanded_arm(arm)]) for arm in Arm)
+        there = self.assuming(stance=stance)
+        return all(there.probe.free(arm, [self.commanded_arm(arm)]) for arm in Arm)
 
     def pushed(self) -> Array:
         """(3,) how much the robot is pushed by what it runs into.

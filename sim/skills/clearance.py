@@ -5,6 +5,7 @@ The hand's distance to an object is measured in the world itself, because the gr
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -104,6 +105,12 @@ class ClearanceProbe:
             for arm in Arm
         }
 
+    def assuming(self, body: Body) -> ClearanceProbe:
+        """This probe for a body under a hypothesis."""
+        there = copy.copy(self)
+        there._body = body
+        return there
+
     def _shape_hand(self, arm: Arm, opening: float) -> None:
         """Puts the fingers of the copy where a hand of that opening has them, coupled joints included."""
         model, qpos = self._world.model, self._scratch.qpos
@@ -165,10 +172,10 @@ class ClearanceProbe:
         return np.array(depths)
 
     def _copy_state(self) -> None:
-        """The world's state, with the stance and the pelvis height that are being considered."""
+        """The world's state, with the stance and the pelvis height that are assumed."""
         qpos, body = self._scratch.qpos, self._body
         qpos[:] = self._world.data.qpos
-        height, stance = body.considered_height_m, body.considered_stance
+        height, stance = body.hypothesis.pelvis_height_m, body.hypothesis.stance
         if height is not None:
             qpos[self._height_adr] = height, body.crouches.pitch(height)
         if stance is not None:

@@ -15,7 +15,7 @@ from sim.skills.checks import check_hold
 from sim.skills.failures import SkillFailure
 from sim.skills.grasps import Grasp
 from sim.skills.manipulate import GRASP_GAP_M, Luck, grip, plan_pick, retreat, stow
-from sim.skills.plan_cache import remembered
+from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill
@@ -23,7 +23,7 @@ from sim.skills.runner import CONTROL_DT_S, Skill
 __all__ = ["assess_hold", "hold", "release"]
 
 
-@remembered
+@cached_plan
 def assess_hold(body: Body, action: Action) -> tuple[Grasp | None, Reach]:
     """What Hold would do; no grasp for a handle.
 

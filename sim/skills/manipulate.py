@@ -23,8 +23,8 @@ from sim.skills.body import Body, wait
 from sim.skills.checks import check_pick, check_place
 from sim.skills.failures import SkillFailure
 from sim.skills.grasps import Grasp, grasp_candidates
-from sim.skills.plan_cache import remembered
-from sim.skills.reach import Reach, blame, explained, fulfils, plan_reach, route
+from sim.skills.plan_cache import cached_plan
+from sim.skills.reach import Reach, diagnose, diagnosed, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.world.liquids import spill
@@ -73,11 +73,11 @@ def plan_pick(body: Body, arm: Arm, thing: ObjectInstance) -> tuple[Grasp, Reach
     if found is not None:
         return found
 
-    def elsewhere() -> None:
+    def elsewhere(body: Body) -> None:
         if _find_grasp(body, arm, thing, _MAX_PLANS // 3) is None:
             raise SkillFailure(FailureCode.OBSTRUCTED)
 
-    raise blame(body, {arm: body.world.grips(thing.object_id)[0]}, elsewhere)
+    raise diagnose(body, {arm: body.world.grips(thing.object_id)[0]}, elsewhere)
 
 
 def _find_grasp(
@@ -350,7 +350,7 @@ def plan_bring(
     shoulder = body.shoulder(arm)
     lift = np.array([0.0, 0.0, above_m - lowest])
 
-    def search() -> tuple[Array, Reach, Array]:
+    def search(body: Body) -> tuple[Array, Reach, Array]:
         for spot in spots:
             sight = spot[:2] - shoulder[:2]
             # keep the hand's azimuth relative to the line of sight, or turn the object a little
@@ -364,7 +364,7 @@ def plan_bring(
                     return spot, reach, -(turn @ pointing)
         raise SkillFailure(FailureCode.OBSTRUCTED)
 
-    return explained(body, {arm: spots[0] + lift - offset}, search)
+    return diagnosed(body, {arm: spots[0] + lift - offset}, search)
 
 
 def place(body: Body, action: Action, luck: Luck) -> Skill:
@@ -410,7 +410,7 @@ def place(body: Body, action: Action, luck: Luck) -> Skill:
         raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})
 
 
-@remembered
+@cached_plan
 def assess_pick(body: Body, action: Action) -> tuple[Grasp, Reach]:
     """What Pick would do.
 
@@ -423,7 +423,7 @@ def assess_pick(body: Body, action: Action) -> tuple[Grasp, Reach]:
     return plan_pick(body, action.arm, thing)
 
 
-@remembered
+@cached_plan
 def assess_place(body: Body, action: Action) -> tuple[Array, Reach, Array]:
     """What Place would do.
 

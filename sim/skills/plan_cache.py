@@ -9,12 +9,12 @@ from typing import TypeVar
 from data.interface.steps import Action
 from sim.skills.body import Body
 
-__all__ = ["remembered"]
+__all__ = ["cached_plan"]
 
 T = TypeVar("T")
 
 
-def remembered(plan: Callable[[Body, Action], T]) -> Callable[[Body, Action], T]:
+def cached_plan(plan: Callable[[Body, Action], T]) -> Callable[[Body, Action], T]:
     """Lets a planner of an action return its last plan again while nothing that it depends on has changed."""
 
     @functools.wraps(plan)

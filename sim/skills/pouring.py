@@ -22,7 +22,7 @@ from sim.skills.body import Body, wait
 from sim.skills.checks import check_fill, check_pour
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import Luck, nudge, plan_bring, stow
-from sim.skills.plan_cache import remembered
+from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.world import liquids
@@ -49,7 +49,7 @@ def _opening(body: Body, thing: ObjectInstance) -> tuple[Array, float]:
     return top, liquids.opening_radius_m(thing)
 
 
-@remembered
+@cached_plan
 def assess_pour(body: Body, action: Action) -> tuple[Reach, float]:
     """What Pour would do: the motion to beside the target, and the turn of the last joint.
 
@@ -158,7 +158,7 @@ def pour(body: Body, action: Action, luck: Luck) -> Skill:
         raise SkillFailure(FailureCode.POUR_MISSED, {"missed_l": poured - came})
 
 
-@remembered
+@cached_plan
 def assess_fill(body: Body, action: Action) -> Reach:
     """What Fill would do.
 

@@ -69,7 +69,7 @@ _QUERIED: Final = 60
 _SOLVED: Final = 3
 #: Upper limit of solved stances in one plan, and in one that is made for another pelvis height to explain a failure.
 _TRIALS: Final = 14
-_TRIALS_EXPLAINING: Final = 4
+_TRIALS_DIAGNOSING: Final = 4
 #: Room between the hands and the door before anything moves.
 _HAND_ROOM_M: Final = 0.004
 #: The same for a hand behind the door: its fingers would hook the door as they close.
@@ -123,7 +123,7 @@ def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> 
     goal = low - _PAST_SHUT * (high - low)
     count = 2 + int(np.ceil(part.travel_m(door.now - goal) / _STEP_M))
     positions = np.linspace(door.now, goal, count)
-    trials = _TRIALS if body.considered_height_m is None else _TRIALS_EXPLAINING
+    trials = _TRIALS if body.hypothesis.pelvis_height_m is None else _TRIALS_DIAGNOSING
     for spot in _spots(body, arm, door, thing):
         for stances in _stances(body, arm, door, spot, positions)[:_SOLVED]:
             if trials == 0:
@@ -283,11 +283,12 @@ def _wrapped(angle: Array) -> Array:
 def _solve(body: Body, arm: Arm, door: Door, spot: tuple[float, float], positions: Array, stances: Array) -> Push | None:
     """The arm's postures along the way, None when it cannot follow or would collide."""
     base = body.commanded_base()
-    with body.considering_stance(Stance(*map(float, stances[0]))):  # a hand that is at the door already would move it
-        states = [body.probe.against_door(a, body.commanded_arm(a), door.part, door.now, fist=False) for a in Arm]
+    first = Stance(*map(float, stances[0]))
+    there = body.assuming(stance=first)  # a hand that is at the door already would move it
+    states = [there.probe.against_door(a, body.commanded_arm(a), door.part, door.now, fist=False) for a in Arm]
     if any(state.gap_m < (_HAND_ROOM_M if door.before(state, door.now) else _FINGERS_M) for state in states):
         return None
-    for wish in _directions(body, arm, door, spot, float(positions[0]), Stance(*map(float, stances[0]))):
+    for wish in _directions(body, arm, door, spot, float(positions[0]), first):
         postures: list[Array] = []
         out_m = _FIST_M
         for position, pose in zip(map(float, positions), stances, strict=True):
@@ -305,9 +306,7 @@ def _solve(body: Body, arm: Arm, door: Door, spot: tuple[float, float], position
         away = _away(body, arm, door, positions, np.stack(postures), Stance(*map(float, stances[-1])))
         if away is None:
             continue
-        first = Stance(*map(float, stances[0]))
-        with body.considering_stance(first):
-            reach = _approach(body, arm, door, spot, float(positions[0]), postures[0])
+        reach = _approach(there, arm, door, spot, float(positions[0]), postures[0])
         if reach is None:
             continue
         moves = float(np.hypot(first.x - base.x, first.y - base.y)) + abs(
@@ -348,18 +347,18 @@ def _at_face(
     start: Array | None,
 ) -> tuple[Array, float] | None:
     """An arm posture whose fist presses on the door, and how far the grasp site then is before the face."""
-    with body.considering_stance(stance):
-        for _ in range(4):
-            goal = body.solve(arm, HandPose(door.point(position, *spot, out_m), pointing), start)
-            if goal.error_m > 0.025:
-                return None
-            state = body.probe.against_door(arm, goal.q, door.part, position)
-            if state.depth_m > TOUCH_M:
-                return None
-            if abs(state.gap_m + _PRESS_M) <= _PRESS_SLACK_M:
-                return (goal.q, out_m) if door.outside(state, position) else None
-            out_m = float(np.clip(out_m - (state.gap_m + _PRESS_M), -0.02, 0.2))
-            start = goal.q
+    there = body.assuming(stance=stance)
+    for _ in range(4):
+        goal = there.solve(arm, HandPose(door.point(position, *spot, out_m), pointing), start)
+        if goal.error_m > 0.025:
+            return None
+        state = there.probe.against_door(arm, goal.q, door.part, position)
+        if state.depth_m > TOUCH_M:
+            return None
+        if abs(state.gap_m + _PRESS_M) <= _PRESS_SLACK_M:
+            return (goal.q, out_m) if door.outside(state, position) else None
+        out_m = float(np.clip(out_m - (state.gap_m + _PRESS_M), -0.02, 0.2))
+        start = goal.q
     return None
 
 
@@ -368,17 +367,18 @@ def _away(body: Body, arm: Arm, door: Door, positions: Array, postures: Array, s
     shut = door.part.range[0]
     order = np.argsort(positions, kind="stable")
     at = np.array([np.interp(shut, positions[order], column[order]) for column in postures.T])
-    with body.considering_stance(stance):
-        goal = body.solve(arm, HandPose(body.hand_at(arm, at) + _BEFORE_M * door.normal(shut)), start=at)
-        if goal.error_m > 0.04:
-            return None
-        states = [body.probe.against_door(arm, at + s * (goal.q - at), door.part, shut) for s in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)]
+    there = body.assuming(stance=stance)
+    goal = there.solve(arm, HandPose(there.hand_at(arm, at) + _BEFORE_M * door.normal(shut)), start=at)
+    if goal.error_m > 0.04:
+        return None
+    shares = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+    states = [there.probe.against_door(arm, at + s * (goal.q - at), door.part, shut) for s in shares]
     caught = any(state.gap_m < min(states[0].gap_m, 0.0) - _CATCH_M for state in states)
     return None if caught else np.stack([at, goal.q])
 
 
 def _approach(body: Body, arm: Arm, door: Door, spot: tuple[float, float], position: float, at: Array) -> Reach | None:
-    """The way of the fist to its first contact, from the stance under consideration."""
+    """The way of the fist to its first contact, from the assumed stance."""
     hand = body.hand_at(arm, at)
     for out in (door.normal(position), 0.7 * door.normal(position) + 0.7 * door.along(position)):
         before: ArmGoal | None = None

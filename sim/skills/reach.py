@@ -19,7 +19,7 @@ from sim.skills.body import REACH_TOLERANCE_M, ArmGoal, Body
 from sim.skills.failures import SkillFailure
 from sim.skills.reach_map import HandPose
 
-__all__ = ["Reach", "blame", "explained", "plan_reach", "route"]
+__all__ = ["Reach", "diagnose", "diagnosed", "plan_reach", "route"]
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -53,15 +53,15 @@ def fulfils(goal: ArmGoal, pointing: float = MIN_POINTING, closing: float = MIN_
     return goal.error_m <= REACH_TOLERANCE_M and goal.pointing_cos >= pointing and goal.closing_cos >= closing
 
 
-def blame(body: Body, points: Mapping[Arm, Array], plan: Callable[[], object]) -> SkillFailure:
+def diagnose(body: Body, points: Mapping[Arm, Array], plan: Callable[[Body], object]) -> SkillFailure:
     """Why a plan failed: whether another pelvis height at this stance would have served, else distance or obstruction.
 
     Args:
         body: the robot.
         points: what each arm reaches for, world frame.
-        plan: plans at the height under consideration; raises SkillFailure when it cannot.
+        plan: plans for a body; raises SkillFailure when it cannot.
     """
-    if body.hurried:
+    if not body.hypothesis.diagnose:
         return SkillFailure(FailureCode.OBSTRUCTED)
     present = body.pelvis_height_m
     common = [height for height in body.heights() if all(body.within(arm, p, height) for arm, p in points.items())]
@@ -73,8 +73,7 @@ def blame(body: Body, points: Mapping[Arm, Array], plan: Callable[[], object]) -
         if abs(height - present) < 0.03:
             continue
         try:
-            with body.considering(height):
-                plan()
+            plan(body.assuming(pelvis_height_m=height))
         except SkillFailure:
             continue
         code = FailureCode.BODY_TOO_HIGH if height < present else FailureCode.BODY_TOO_LOW
@@ -84,16 +83,16 @@ def blame(body: Body, points: Mapping[Arm, Array], plan: Callable[[], object]) -
     return SkillFailure(FailureCode.OBSTRUCTED, {"gap_m": gap})
 
 
-def explained(body: Body, points: Mapping[Arm, Array], search: Callable[[], T]) -> T:
-    """What a search finds; a search that fails is blamed on distance, height or obstruction, see `blame`.
+def diagnosed(body: Body, points: Mapping[Arm, Array], search: Callable[[Body], T]) -> T:
+    """What a search finds; one that fails is put down to distance, height or obstruction, see `diagnose`.
 
     Raises:
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
     try:
-        return search()
+        return search(body)
     except SkillFailure:
-        raise blame(body, points, search) from None
+        raise diagnose(body, points, search) from None
 
 
 def route(

@@ -25,8 +25,8 @@ from sim.skills.checks import check_place_both
 from sim.skills.clearance import TOUCH_M
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import Luck, upright
-from sim.skills.plan_cache import remembered
-from sim.skills.reach import blame
+from sim.skills.plan_cache import cached_plan
+from sim.skills.reach import diagnose
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.skills.two_arm import BOTH_TOLERANCE_M, against_sag, hands_m
@@ -66,7 +66,7 @@ class BothPlacement:
     at: BothGoal
 
 
-@remembered
+@cached_plan
 def assess_place_both(body: Body, action: Action) -> BothPlacement:
     """What PlaceBoth would do.
 
@@ -83,7 +83,7 @@ def assess_place_both(body: Body, action: Action) -> BothPlacement:
     heights = [_height_over(body, load, spot) for spot in spots]
     carried_m = body.hand_height(_hold(body))
 
-    def search() -> BothPlacement:
+    def search(body: Body) -> BothPlacement:
         higher_m = body.hand_height(_hold(body)) - carried_m  # the load comes along with the pelvis
         for spot, over_m in zip(spots, heights, strict=True):
             if over_m is None:
@@ -102,10 +102,10 @@ def assess_place_both(body: Body, action: Action) -> BothPlacement:
         raise SkillFailure(FailureCode.OBSTRUCTED)
 
     try:
-        return search()
+        return search(body)
     except SkillFailure:
         way = load.above(spots[0])[:3, 3] - load.turned[:3, 3]
-        raise blame(body, {arm: body.hand_pose(arm)[0] + way for arm in Arm}, search) from None
+        raise diagnose(body, {arm: body.hand_pose(arm)[0] + way for arm in Arm}, search) from None
 
 
 def _hold(body: Body) -> BothGoal:

@@ -22,7 +22,7 @@ from sim.skills.body import Body, wait
 from sim.skills.checks import check_clean, check_slice, check_use_up
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import GRASP_GAP_M, Luck, nudge, plan_bring, stow
-from sim.skills.plan_cache import remembered
+from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
 from sim.skills.runner import Skill
 from sim.world.liquids import wipe
@@ -48,7 +48,7 @@ def _blade(tool: ObjectInstance) -> Array:
     return np.asarray(tool.type.parts[0].center)
 
 
-@remembered
+@cached_plan
 def assess_slice(body: Body, action: Action) -> Reach:
     """What Slice would do.
 
@@ -62,7 +62,7 @@ def assess_slice(body: Body, action: Action) -> Reach:
     return plan_bring(body, action.arm, tool, [_top(body, thing)], names, point=_blade(tool), above_m=0.002)[1]
 
 
-@remembered
+@cached_plan
 def assess_clean(body: Body, action: Action) -> Reach:
     """What Clean would do.
 
@@ -80,7 +80,7 @@ def assess_clean(body: Body, action: Action) -> Reach:
     return plan_bring(body, action.arm, tool, spots, (tool.object_id, thing.object_id), above_m=0.002)[1]
 
 
-@remembered
+@cached_plan
 def assess_use_up(body: Body, action: Action) -> Reach:
     """What UseUp would do.
 

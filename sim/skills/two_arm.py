@@ -22,8 +22,8 @@ from sim.skills.checks import check_lift
 from sim.skills.failures import SkillFailure
 from sim.skills.grasps import solid_box
 from sim.skills.manipulate import GRASP_GAP_M, Luck
-from sim.skills.plan_cache import remembered
-from sim.skills.reach import blame, route
+from sim.skills.plan_cache import cached_plan
+from sim.skills.reach import diagnose, route
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.world.liquids import spill
@@ -89,7 +89,7 @@ def _goal(body: Body, sides: Mapping[Arm, tuple[Array, Array]], apart_m: float, 
     return body.solve_both(wishes, start)
 
 
-@remembered
+@cached_plan
 def assess_lift(body: Body, action: Action) -> BothReach:
     """What Lift would do.
 
@@ -102,7 +102,7 @@ def assess_lift(body: Body, action: Action) -> BothReach:
     sides = _sides(body, thing)
     name = (thing.object_id,)
 
-    def search() -> BothReach:
+    def search(body: Body) -> BothReach:
         before = _goal(body, sides, _APART_M, None)
         at = _goal(body, sides, 0.004, before.arms)
         if before.error_m > BOTH_TOLERANCE_M or at.error_m > BOTH_TOLERANCE_M:
@@ -116,9 +116,9 @@ def assess_lift(body: Body, action: Action) -> BothReach:
         return BothReach(_way(body, before), before, at)
 
     try:
-        return search()
+        return search(body)
     except SkillFailure:
-        raise blame(body, {arm: point for arm, (point, _) in sides.items()}, search) from None
+        raise diagnose(body, {arm: point for arm, (point, _) in sides.items()}, search) from None
 
 
 def _way(body: Body, goal: BothGoal) -> BothGoal:

@@ -12,7 +12,7 @@ from sim.skills.articulate import assess_open_close
 from sim.skills.body import Body
 from sim.skills.failures import SkillFailure
 from sim.skills.navigation import Stance
-from sim.skills.plan_cache import remembered
+from sim.skills.plan_cache import cached_plan
 from sim.skills.push import Push
 from sim.skills.runner import refuse, run_skills
 from sim.skills.set_down import assess_place_both
@@ -151,13 +151,24 @@ def test_a_push_is_planned_without_moving_anything_and_always_alike(session):
     assert body.planning_state() == before[2]
 
 
-def test_a_stance_under_consideration_is_part_of_what_plans_depend_on(session):
+def test_a_hypothesis_is_a_value_and_part_of_what_plans_depend_on(session):
     start(session)
     body = session.body
-    state, base = body.planning_state(), body.commanded_base()
-    with body.considering_stance(Stance(0.5, 0.5, 0.1)):
-        assert body.planning_state() != state and body.commanded_base() == Stance(0.5, 0.5, 0.1)
-    assert body.planning_state() == state and body.commanded_base() == base
+    state, base, height = body.planning_state(), body.commanded_base(), body.pelvis_height_m
+    there = body.assuming(stance=Stance(0.5, 0.5, 0.1))
+    assert there.planning_state() != state and there.commanded_base() == Stance(0.5, 0.5, 0.1)
+    lower = there.assuming(pelvis_height_m=0.8)
+    assert (lower.commanded_base(), lower.pelvis_height_m) == (Stance(0.5, 0.5, 0.1), 0.8)
+    assert body.assuming(diagnose=False).planning_state() != state
+    assert (body.planning_state(), body.commanded_base(), body.pelvis_height_m) == (state, base, height)
+
+
+def test_postures_from_an_assumed_stance_are_those_from_there(session):
+    start(session)
+    body = session.body
+    q, base = body.commanded_arm(Arm.LEFT), body.commanded_base()
+    moved = body.assuming(stance=Stance(base.x + 0.3, base.y - 0.1, base.yaw_rad))
+    assert np.allclose(moved.hand_at(Arm.LEFT, q) - body.hand_at(Arm.LEFT, q), (0.3, -0.1, 0.0))
 
 
 def test_a_switch_is_pressed(session):
@@ -317,7 +328,7 @@ def test_a_plan_is_made_once_until_something_changes(session):
     start(session)
     made = []
 
-    @remembered
+    @cached_plan
     def plan(body, action):
         made.append(action)
         return object()
@@ -331,5 +342,4 @@ def test_a_plan_is_made_once_until_something_changes(session):
     assert second is not first
     body.command_hand(Arm.LEFT, 0.5)
     assert plan(body, action) is not second
-    with body.considering(0.8):
-        assert plan(body, action) is not second
+    assert plan(body.assuming(pelvis_height_m=0.8), action) is not second
