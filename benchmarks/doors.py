@@ -102,10 +102,10 @@ def try_lid(session: Session, room: str, name: str) -> list[bool]:
             if thing.is_open != (verb == "Close"):  # the verb before failed
                 session.reset(FreePlay(room, states={name: {"isOpen": verb == "Close"}}), 0)
                 thing = session.world.objects[name]
-            place, carriers = session.world.pose(name)[:3, 3], session.world.parents(name)
+            place, carriers = session.world.poses.pose(name)[:3, 3], session.world.containment.parents(name)
             code, seconds = reach(session, Action(verb, arm=arm, object_id=name), (None, *PLACES[:5]))
-            moved = float(np.linalg.norm(session.world.pose(name)[:2, 3] - place[:2]))
-            stays = session.world.parents(name) == carriers and moved < STAYS_M
+            moved = float(np.linalg.norm(session.world.poses.pose(name)[:2, 3] - place[:2]))
+            stays = session.world.containment.parents(name) == carriers and moved < STAYS_M
             done.append(code == "ok" and stays)
             line = (
                 f"{session.robot.name:5}{room:15}{name:17}{verb:7}{arm.value:6}{code:15}open {thing.openness:.2f}  "

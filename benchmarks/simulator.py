@@ -91,10 +91,10 @@ def default_renderer(world: World, size: int) -> Callable[[], Any]:
 
 def views(size: int = 224) -> dict[str, float]:
     world = World(load_robot("h1"), "kitchen_1")
-    ours = median_ms(lambda: world.render("head", size, size))
-    depth = median_ms(lambda: world.render("head", size, size, depth=True))
-    labels = median_ms(lambda: world.render("head", size, size, segmentation=True))
-    both = median_ms(lambda: world.render("head", size, size, depth=True, segmentation=True))
+    ours = median_ms(lambda: world.cameras.render("head", size, size))
+    depth = median_ms(lambda: world.cameras.render("head", size, size, depth=True))
+    labels = median_ms(lambda: world.cameras.render("head", size, size, segmentation=True))
+    both = median_ms(lambda: world.cameras.render("head", size, size, depth=True, segmentation=True))
     default = median_ms(default_renderer(world, size), count=5, warm=1)
     return {
         "rgb_ms": ours,
@@ -143,12 +143,12 @@ def camera_frames(size: int = 256) -> dict[str, float]:
     for name, camera in (("plain", False), ("camera", True)):
         steps, started = 0, time.perf_counter()
         while time.perf_counter() - started < 5.0:
-            world.set_joint_targets(
+            world.servos.set_joint_targets(
                 {joint: rest + rng.uniform(-0.2, 0.2) for joint, rest in zip(arm.joints, arm.rest, strict=True)}
             )
             world.advance(0.05)
             if camera:
-                world.render("head", size, size)
+                world.cameras.render("head", size, size)
             steps += 1
         seconds = time.perf_counter() - started
         rates |= {f"{name}_steps_per_s": steps / seconds, f"{name}_real_time": 0.05 * steps / seconds}

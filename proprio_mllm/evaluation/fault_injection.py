@@ -35,6 +35,7 @@ from sim.expert.expert import Expert
 from sim.session.session import Session
 from sim.tasks.predicates import Predicate
 from sim.tasks.task import Task
+from sim.world.metadata import world_metadata
 
 __all__ = ["CAUSES", "LATE_SLIPS", "SLIPS", "Cause", "FaultyPlanner"]
 
@@ -86,12 +87,12 @@ class Moment:
     def distance_m(self, action: Action) -> float:
         """From the robot to the outline of an action's object, horizontally."""
         assert action.object_id is not None
-        return self.session.world.distance_to(action.object_id)
+        world = self.session.world
+        return world.servos.distance_to(world.poses.bounds(action.object_id))
 
     def refused_at(self, action: Action, pelvis_height_m: float) -> bool:
         """Whether the arm would not try an action with the pelvis at another height, at this stance."""
-        with self.session.body.considering(pelvis_height_m):
-            return self.session.assess(action) is not None
+        return self.session.assess(action, pelvis_height_m=pelvis_height_m) is not None
 
     @property
     def heights_m(self) -> tuple[float, float]:
@@ -298,7 +299,8 @@ def _forgets_to_open(now: Moment) -> Script | None:
     loaded = next((arm for arm in (Arm.RIGHT, Arm.LEFT) if held[arm] is not None), None)
     if loaded is not None:
         return _forever(Action("Place", loaded, door.object_id).to_text())
-    inside = [name for name in sorted(now.session.world.objects) if door.object_id in now.session.world.parents(name)]
+    parents = now.session.world.containment.all_parents()
+    inside = [name for name in sorted(now.session.world.objects) if door.object_id in parents.get(name, ())]
     wanted = {name for goal in now.task.goals for name in goal.object_ids()}
     target = next((name for name in inside if name in wanted), None)
     return None if target is None else _forever(Action("Pick", door.arm, target).to_text())
@@ -512,7 +514,7 @@ class FaultyPlanner:
     def _satisfied(self) -> bool:
         """Whether all holds that the planner believes in: it is done, and not stuck for a reason of its own."""
         assert self._session is not None and self._believed is not None
-        metadata = self._session.world.metadata()
+        metadata = world_metadata(self._session.world)
         return all(goal.holds(metadata) for goal in self._believed)
 
     def _is_away(self, action: Action) -> bool:
@@ -520,7 +522,8 @@ class FaultyPlanner:
         assert self._session is not None
         if action.spec.kind is ActionKind.BODY or action.object_id is None:
             return True
-        return self._session.world.distance_to(action.object_id) >= _OUT_OF_REACH_M
+        world = self._session.world
+        return world.servos.distance_to(world.poses.bounds(action.object_id)) >= _OUT_OF_REACH_M
 
     def _moment(self) -> Moment:
         """What the expert proposes, with the goals that this planner believes in."""

@@ -16,6 +16,7 @@ from proprio_mllm.evaluation.starts import started
 from proprio_mllm.planners.protocol import Planner
 from sim.session.session import Session
 from sim.tasks.task import Task
+from sim.world.metadata import world_metadata
 
 __all__ = ["SimSession", "open_session"]
 
@@ -44,7 +45,7 @@ class SimSession:
 
     def goals(self) -> GoalReport:
         """Which goals hold now."""
-        metadata = self.session.world.metadata()
+        metadata = world_metadata(self.session.world)
         met = tuple(goal.holds(metadata) for goal in self.task.goals)
         return GoalReport(met, unmet_objects(self.task, met))
 
@@ -56,7 +57,7 @@ class SimSession:
     def relations(self) -> Mapping[str, Sequence[str]]:
         """What holds of which objects now, from the simulator's metadata."""
         found: dict[str, list[str]] = defaultdict(list)
-        for entry in self.session.world.metadata()["objects"]:
+        for entry in world_metadata(self.session.world)["objects"]:
             name = entry["objectId"]
             if entry["isPickedUp"]:
                 found["held"].append(name)

@@ -134,7 +134,7 @@ def _act(episode: Episode, size: int) -> ActedOut:
     goals: list[tuple[bool, ...]] = []
     codes: list[tuple[str, ...]] = []
     for moment in reenactment.moments():
-        picture = reenactment.session.world.render("head", size, size).rgb
+        picture = reenactment.session.world.cameras.render("head", size, size).rgb
         text = base64.b64encode(encode_jpeg(picture)).decode()
         shown.append(images.setdefault(text, len(images)))
         goals.append(moment.goals)

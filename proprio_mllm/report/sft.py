@@ -147,7 +147,7 @@ class _Maker:
                 return _Result(job.number, [], f"step {moment.number} gave {again}, the ledger says {ledger}")
             if before is not None and moment.feedback is not None and (moment.feedback.success or self._choice.failed_steps):
                 rows.append(self._row(job, before, moment, moment.feedback.success))
-            before = (moment.observation, reenactment.session.world.render("head", size, size).rgb)
+            before = (moment.observation, reenactment.session.world.cameras.render("head", size, size).rgb)
         return _Result(job.number, rows)
 
     def _row(self, job: _Job, before: tuple[Observation, NDArray[np.uint8]], moment: Moment, success: bool) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def replay(run: Run, task: str, trial: int = 0, size: int = 320, camera: str = "
     world = reenactment.session.world
     frames: list[Frame] = []
     for moment in reenactment.moments():
-        views = [world.render(name, size, size).rgb for name in ("head", camera)]
+        views = [world.cameras.render(name, size, size).rgb for name in ("head", camera)]
         words = " ".join(code or "ok" for code in moment.codes) + (" (differs from the ledger)" if moment.differs else "")
         if moment.differs:
             logger.warning("%s: %s gave %s, the ledger says %s", task, moment.text, moment.codes, moment.expected)

@@ -116,7 +116,7 @@ def replay_clip(motion: Motion, cfg: ReplayConfig, seed: int) -> Pictures | None
         views, cameras = [], []
         for frame in frames:
             set_frame(world, motion, int(frame), *placed)
-            views.append(world.render("head", cfg.image_size, cfg.image_size, depth=True))
+            views.append(world.cameras.render("head", cfg.image_size, cfg.image_size, depth=True))
             cameras.append(camera_in_pelvis(world, views[-1]))
         world.data.qpos[:] = before
         mujoco.mj_kinematics(world.model, world.data)

@@ -99,7 +99,7 @@ def draw_pose(world: World, free: Array, rng: np.random.Generator) -> Pose:
         names = list(world.objects)
         movable = [name for name in names if world.objects[name].movable]
         pool = movable if movable and rng.random() < 0.6 else names
-        target = world.center(pool[int(rng.integers(len(pool)))])[:2]
+        target = world.poses.center(pool[int(rng.integers(len(pool)))])[:2]
         gaps = np.linalg.norm(free - target, axis=1)
         near = free[(gaps > _FACING_DISTANCE_M[0]) & (gaps < _FACING_DISTANCE_M[1])]
         if len(near):
@@ -154,7 +154,7 @@ def lead_in(world: World, before: Pose, pose: Pose, rng: np.random.Generator) ->
 
 def camera_in_pelvis(world: World, view: View) -> Array:
     """(4, 4) pose of a view's camera in the pelvis heading frame."""
-    x, y, z, yaw = world.base_pose[:4]
+    x, y, z, yaw = world.servos.base_pose[:4]
     c, s = np.cos(yaw), np.sin(yaw)
     pelvis = np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]])
     return np.linalg.inv(pelvis) @ view.camera_in_world
@@ -162,12 +162,14 @@ def camera_in_pelvis(world: World, view: View) -> Array:
 
 def visible_json(world: World, segmentation: NDArray[np.int32]) -> str:
     """What a view shows: id, type, centre in the pelvis heading frame (m), pixels and bounding box (x0, y0, x1, y1)."""
-    root = np.array([*world.base_pose[:3], np.cos(world.base_pose[3] / 2), 0.0, 0.0, np.sin(world.base_pose[3] / 2)])
+    root = np.array(
+        [*world.servos.base_pose[:3], np.cos(world.servos.base_pose[3] / 2), 0.0, 0.0, np.sin(world.servos.base_pose[3] / 2)]
+    )
     ids = list(world.objects)
     found: list[dict[str, Any]] = []
     for index in np.unique(segmentation[segmentation >= 0]):
         rows, columns = np.nonzero(segmentation == index)
-        center = world_to_heading(world.center(ids[index])[None], root)[0]
+        center = world_to_heading(world.poses.center(ids[index])[None], root)[0]
         found.append({
             "id": ids[index],
             "type": world.objects[ids[index]].type.name,
@@ -235,7 +237,7 @@ def views_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
         world = _random_world(config, index, rng)
         assert world.robot is not None
         free = navigation_map(world, world.robot.footprint_radius_m).free_positions()
-        renderer = Renderer(world, config.image_size, config.image_size)
+        renderer = Renderer(world.scene, config.image_size, config.image_size)
         before = draw_pose(world, free, rng)
         for number in range(start, min(start + config.views_per_world, numbers.stop)):
             pose = draw_pose(world, free, rng)

@@ -26,6 +26,7 @@ from sim.skills.failures import SkillFailure
 from sim.skills.navigation import Stance, wrap_angle
 from sim.skills.registry import excludes
 from sim.tasks.predicates import Predicate
+from sim.world.metadata import world_metadata
 
 __all__ = ["Expert"]
 
@@ -152,11 +153,10 @@ class Expert:
     def facts(self) -> Facts:
         """What the planner reads from the simulator."""
         session = self._session
-        objects = {entry["objectId"]: entry for entry in session.world.metadata()["objects"]}
+        objects = {entry["objectId"]: entry for entry in world_metadata(session.world)["objects"]}
         lifted = session.body.lifted
-        two_handed = frozenset(
-            name for name, thing in session.world.objects.items() if thing.movable and session.world.needs_two_hands(name)
-        )
+        heavy = session.world.containment.needs_two_hands
+        two_handed = frozenset(name for name, item in session.world.objects.items() if item.movable and heavy(name))
         held = {arm: None if item == lifted else item for arm, item in session.body.held.items()}
         things = session.world.objects
         links = session.world.room.links
@@ -451,10 +451,10 @@ class Expert:
         thing = world.objects[job.target]
         if not job.verb.startswith("Place") or load is None or (thing.type.encloses and not thing.type.lidded):
             return 0.0
-        spot = world.free_spot(job.target, 0.03)
+        spot = world.containment.free_spot(job.target, 0.03)
         if spot is None:
             return 0.0
-        missing = float(spot[2]) + _OVER_EDGE_M - float(world.bounds(load)[0][2])
+        missing = float(spot[2]) + _OVER_EDGE_M - float(world.poses.bounds(load)[0][2])
         return min(missing, body.spec.pelvis_height_range_m[1] - body.pelvis_height_m)
 
     def _height_change(self, height_m: float) -> Action:
@@ -487,7 +487,8 @@ class Expert:
         return wrap_angle(float(np.arctan2(delta[1], delta[0])) - base.yaw_rad)
 
     def _is_far(self, object_id: str) -> bool:
-        return self._session.world.distance_to(object_id) > _FAR_M
+        world = self._session.world
+        return world.servos.distance_to(world.poses.bounds(object_id)) > _FAR_M
 
 
 def _single(action: Action) -> PlanStep:

@@ -119,7 +119,7 @@ class Rehearsal:
     def _pull_open(self, object_id: str) -> None:
         """Puts a door or a drawer wide open; what lies in a drawer comes along."""
         world = self._session.world
-        thing, contents = world.objects[object_id], world.contents(object_id)
+        thing, contents = world.objects[object_id], world.containment.contents(object_id)
         for part in thing.moving:
             frame = world.data.xpos[world.model.jnt_bodyid[part.joint_id]]
             before = frame.copy()
@@ -176,4 +176,4 @@ class Rehearsal:
 
     def _put(self, stance: Stance, height_m: float) -> None:
         """Moves robot and load rigidly; the legs follow the height."""
-        self._session.world.put_base(stance.x, stance.y, stance.yaw_rad, height_m)
+        self._session.world.grasps.put_base(stance.x, stance.y, stance.yaw_rad, height_m)

@@ -29,6 +29,7 @@ from sim.interfaces.poses import interactable_poses, random_placements, set_obje
 from sim.scene.rooms import load_room
 from sim.session.session import FreePlay, Session, SessionSnapshot, TaskLike
 from sim.skills.navigation import wrap_angle
+from sim.world.metadata import world_metadata
 
 __all__ = ["THOR_CODES", "Controller", "Event"]
 
@@ -334,11 +335,11 @@ class Controller:
 
     def _event(self, name: str, outcomes: tuple[ActionOutcome, ...], result: Any) -> Event:
         session = self.session
-        view = session.world.render("head", self._size, self._size, depth=True, segmentation=True)
+        view = session.world.cameras.render("head", self._size, self._size, depth=True, segmentation=True)
         assert view.depth is not None and view.segmentation is not None
         failed = [outcome for outcome in outcomes if not outcome.success]
-        metadata = session.world.metadata()
-        visible = set(session.world.visible_objects(view.segmentation))
+        metadata = world_metadata(session.world)
+        visible = set(session.world.cameras.visible_objects(view.segmentation))
         for entry in metadata["objects"]:
             entry["visible"] = entry["objectId"] in visible
             entry["obstructed"] = not entry["visible"]
@@ -377,7 +378,7 @@ class Controller:
             depth_frame=view.depth,
             instance_segmentation_frame=colors[view.segmentation],
             color_to_object_id={(int(r), int(g), int(b)): names[i] for i, (r, g, b) in enumerate(palette)},
-            third_party_camera_frames=[session.world.render(c, self._size, self._size).rgb for c in self._cameras],
+            third_party_camera_frames=[session.world.cameras.render(c, self._size, self._size).rgb for c in self._cameras],
         )
 
 

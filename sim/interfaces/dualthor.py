@@ -31,6 +31,7 @@ from sim.interfaces.aliases import to_action
 from sim.interfaces.poses import interactable_poses
 from sim.session.session import FreePlay, Session, SessionSnapshot
 from sim.skills.locomotion import best_stance
+from sim.world.metadata import world_metadata
 
 __all__ = ["SCENES", "Controller"]
 
@@ -282,14 +283,14 @@ class Controller:
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
             file = self._folder / f"step_{self.session.stats.steps:05d}_{self._at:05d}.png"
-            iio.imwrite(file, self.session.world.render("head", self._size, self._size).rgb)
+            iio.imwrite(file, self.session.world.cameras.render("head", self._size, self._size).rgb)
             path = str(file)
         return {"success": success, "imgpath": path, "msg": message, "sceneState": self._scene_state()}
 
     def _scene_state(self) -> Reply:
         session = self.session
-        metadata = session.world.metadata()
-        visible = set(session.world.visible_objects())
+        metadata = world_metadata(session.world)
+        visible = set(session.world.cameras.visible_objects())
         for entry in metadata["objects"]:
             entry["visible"] = entry["objectId"] in visible
             for key in ("parentReceptacles", "receptacleObjectIds"):

@@ -105,7 +105,7 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]  # one render mode, one return type
         """The view from behind the robot, (480, 480, 3) uint8, in `rgb_array` mode."""
-        return self._session.world.render("behind", 480, 480).rgb if self.render_mode == "rgb_array" else None
+        return self._session.world.cameras.render("behind", 480, 480).rgb if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
         """Frees the drawing contexts."""

@@ -151,7 +151,7 @@ def _check_overlap(world: World, name: str) -> None:
     for contact in world.data.contact[: world.data.ncon]:
         if (int(contact.geom1) in mine) != (int(contact.geom2) in mine) and contact.dist < -_TOUCH_M:
             other = int(contact.geom2) if int(contact.geom1) in mine else int(contact.geom1)
-            index = int(world.object_of_geom[other])
+            index = int(world.scene.object_of_geom[other])
             what = list(world.objects)[index] if index >= 0 else str(world.model.geom(other).name)
             raise WorldError(f"{name} would overlap with {what} by {-contact.dist:.3f} m")
 

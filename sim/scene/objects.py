@@ -179,6 +179,11 @@ class ObjectInstance:
         return self.type.encloses and not self.is_open
 
     @property
+    def laden_mass_kg(self) -> float:
+        """Mass with the liquid that it holds; the liquid of furniture does not weigh."""
+        return self.mass_kg + (self.state.fillLitres if self.movable else 0.0)
+
+    @property
     def is_broken(self) -> bool:
         """Whether it is broken."""
         return self.state.isBroken

@@ -42,13 +42,13 @@ def proprioception(world: World) -> Proprioception:
 
 def head_camera(world: World, size: int) -> Camera:
     """The head camera with its pose in the pelvis heading frame, which follows from the robot's own joints."""
-    in_world = camera_pose(world, "head")
+    in_world = camera_pose(world.scene, "head")
     root = world.motion(1).root_pose[-1]
     position = world_to_heading(in_world[None, :3, 3], root)[0]
     axes = world_to_heading(in_world[:3, :3].T + root[:3], root).T
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = axes, position
-    return Camera(camera_intrinsics(world, "head", size, size), pose, size, size)
+    return Camera(camera_intrinsics(world.scene, "head", size, size), pose, size, size)
 
 
 def observe(
@@ -74,11 +74,11 @@ def observe(
     size = image_size or _PROBE_SIZE
     image: NDArray[np.uint8] = np.zeros((0, 0, 3), dtype=np.uint8)
     if image_size:
-        view = world.render("head", size, size, segmentation=True)
+        view = world.cameras.render("head", size, size, segmentation=True)
         image, labels = view.rgb, view.segmentation
     else:
-        labels = world.labels("head", size, size)
-    visible = visible_ids(world.visible_objects(labels), world.objects)
+        labels = world.cameras.labels("head", size, size)
+    visible = visible_ids(world.cameras.visible_objects(labels), world.objects)
     assert world.robot is not None
     return Observation(
         instruction=instruction,

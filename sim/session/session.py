@@ -30,6 +30,7 @@ from sim.skills.body import Body, ready_posture
 from sim.skills.failures import SkillFailure
 from sim.skills.registry import assess_action, skills_for
 from sim.skills.runner import CONTROL_DT_S, run_skills
+from sim.world.metadata import world_metadata
 from sim.world.snapshot import WorldSnapshot
 from sim.world.world import World
 
@@ -169,14 +170,14 @@ class Session:
         self._all_known = all_known
         self.image_size = image_size
         self._config = load_contingency(contingency)
-        self._luck = Contingency(self._config, difficulty, 0)
+        self._contingency = Contingency(self._config, difficulty, 0)
         self.stats = SessionStats()
         self.watchers: list[Callable[[World, str], None]] = []
         self._seen: set[str] = set()
         self._history: list[HistoryItem] = []
         self._ended = False
         self._opened = False
-        self._lucky = False
+        self._certain = False
 
     # ---- episode
 
@@ -211,7 +212,7 @@ class Session:
         )
         self.body = Body(self.world)
         self.task = task
-        self._luck = dataclasses.replace(self._luck, seed=seed)
+        self._contingency = dataclasses.replace(self._contingency, seed=seed)
         self.stats = SessionStats()
         self._seen, self._history, self._ended, self._opened = set(), [], False, True
         return self.observation()
@@ -278,32 +279,39 @@ class Session:
     def imagining(self) -> Iterator[None]:
         """Steps taken inside are undone at its end, nobody watches them, and no contingency strikes; for the expert."""
         before, watchers = self.snapshot(), self.watchers
-        self.watchers, self._lucky = [], True
+        self.watchers, self._certain = [], True
         try:
             yield
         finally:
             self.restore(before)
-            self.watchers, self._lucky = watchers, False
+            self.watchers, self._certain = watchers, False
 
     def draw(self, action: Action) -> str:
         """The contingency of an action at the present step."""
-        if self._lucky:
+        if self._certain:
             return "success"
         object_id = self.body.subject(action)
         thing = self.world.objects[object_id]
         state = {name: getattr(thing.state, name) for name in ("isFilledWithLiquid", "isToggled", "isDirty", "isBroken")}
-        return self._luck.draw(self.stats.steps, action.name, object_id, thing.type.name, state)
+        return self._contingency.draw(self.stats.steps, action.name, object_id, thing.type.name, state)
 
-    def assess(self, action: Action, diagnose: bool = True) -> SkillFailure | None:
-        """Why an action would be refused right now, None when it would be tried. Moves nothing; for the privileged expert."""
-        return assess_action(self.body.assuming(diagnose=diagnose), action, frozenset(self.known_objects))
+    def assess(self, action: Action, diagnose: bool = True, pelvis_height_m: float | None = None) -> SkillFailure | None:
+        """Why an action would be refused right now, None when it would be tried. Moves nothing; for the privileged expert.
+
+        Args:
+            action: what is asked about.
+            diagnose: whether a refusal says what is wrong, see `Hypothesis`.
+            pelvis_height_m: an assumed pelvis height; as it is when None.
+        """
+        there = self.body.assuming(pelvis_height_m=pelvis_height_m, diagnose=diagnose)
+        return assess_action(there, action, frozenset(self.known_objects))
 
     def teleport(self, x_m: float, y_m: float, yaw_rad: float, pelvis_height_m: float | None = None) -> None:
         """Puts the base somewhere at once, and what the hands hold with it; the pelvis height stays when it is None.
 
         Privileged; not an action of the grammar, and no part of any planner's episode.
         """
-        self.world.put_base(x_m, y_m, yaw_rad, pelvis_height_m)
+        self.world.grasps.put_base(x_m, y_m, yaw_rad, pelvis_height_m)
 
     # ---- views
 
@@ -329,7 +337,7 @@ class Session:
 
     def goal_status(self) -> tuple[bool, ...]:
         """Whether each of the task's goals holds."""
-        metadata = self.world.metadata()
+        metadata = world_metadata(self.world)
         return tuple(goal.holds(metadata) for goal in self.task.goals)
 
     @property
@@ -369,4 +377,4 @@ class Session:
     def close(self) -> None:
         """Frees the drawing contexts of the running episode."""
         if self._opened:
-            self.world.close()
+            self.world.cameras.close()

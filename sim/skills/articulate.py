@@ -26,7 +26,7 @@ from sim.skills.checks import check_open_close, check_toggle
 from sim.skills.failures import SkillFailure
 from sim.skills.lids import closed_on, led_on, plan_lead, plan_tab
 from sim.skills.locomotion import sweep
-from sim.skills.manipulate import GRASP_GAP_M, Luck, stow
+from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, stow
 from sim.skills.navigation import Stance
 from sim.skills.plan_cache import cached_plan
 from sim.skills.push import Push, plan_push, push_shut
@@ -193,7 +193,7 @@ def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
     Raises:
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
-    handle = body.world.handle(thing.object_id)
+    handle = body.world.poses.handle(thing.object_id)
     bar = tuple(map(int, body.part_geoms(thing, "handle")))
 
     def search(body: Body) -> Reach:
@@ -244,7 +244,7 @@ def _plan_pull(body: Body, arm: Arm, part: MovingPart, reach: Reach, hand: Array
     return best if done else None
 
 
-def open_close(body: Body, action: Action, luck: Luck) -> Skill:
+def open_close(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Open and Close: leads a door or drawer by its handle; a handle that slipped on the way is taken once more.
 
     Raises:
@@ -257,7 +257,7 @@ def open_close(body: Body, action: Action, luck: Luck) -> Skill:
         try:
             pull = assess_open_close(body, action)
             if not outcome:
-                outcome = luck(action)
+                outcome = outcome_draw(action)
             if isinstance(pull, Push):
                 yield from push_shut(body, action, pull, outcome)
             else:
@@ -305,20 +305,20 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
         code = FailureCode.LOCKED if outcome == "locked" else FailureCode.NOTHING_HAPPENED
         raise SkillFailure(code, contingency=outcome)
     if part.spec.is_lid:  # a lid hangs at its tab, a door at the hand around its bar
-        body.world.give_way(thing.object_id, part)
+        body.world.grasps.give_way(thing.object_id, part)
         yield from wait(0.2)
-        tab = body.world.handle(thing.object_id)
-        body.world.attach(arm.value, thing.object_id, part, tab)
+        tab = body.world.poses.handle(thing.object_id)
+        body.world.grasps.attach(arm.value, thing.object_id, part, tab)
         pull = _aligned(body, arm, pull, tab)
     else:
-        body.world.attach(arm.value, thing.object_id, part)
+        body.world.grasps.attach(arm.value, thing.object_id, part)
     yield from _lead(body, arm, pull)
     if thing.self_closing and action.name == "Open" and _share(body, part) >= _OPEN_MIN:
         return
-    body.world.detach(arm.value)
+    body.world.grasps.detach(arm.value)
     yield from body.move_hand(arm, 1.0, 0.2)
     position, hand = body.hand_pose(arm)
-    ways = _off_lid(body, part, body.world.handle(thing.object_id)) if part.spec.is_lid else (-0.08 * hand[:, 0],)
+    ways = _off_lid(body, part, body.world.poses.handle(thing.object_id)) if part.spec.is_lid else (-0.08 * hand[:, 0],)
     for way in ways:
         away = body.solve(arm, HandPose(position + way, hand[:, 0]), start=body.commanded_arm(arm))
         if away.error_m < 0.03:
@@ -376,7 +376,7 @@ def assess_toggle(body: Body, action: Action) -> Reach:
     assert action.arm is not None and action.object_id is not None
     arm, thing = action.arm, body.thing(action.object_id)
     check_toggle(body, arm, thing, action.name == "ToggleOn")
-    return plan_press(body, arm, body.world.toggle_point(thing.object_id), (thing.object_id,))
+    return plan_press(body, arm, body.world.poses.toggle_point(thing.object_id), (thing.object_id,))
 
 
 def plan_press(body: Body, arm: Arm, point: Array, ignore: tuple[str, ...]) -> Reach:
@@ -403,7 +403,7 @@ def plan_press(body: Body, arm: Arm, point: Array, ignore: tuple[str, ...]) -> R
     return diagnosed(body, {arm: point}, search)
 
 
-def toggle(body: Body, action: Action, luck: Luck) -> Skill:
+def toggle(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """ToggleOn and ToggleOff: presses a switch or knob with the fingers.
 
     Raises:
@@ -418,9 +418,9 @@ def toggle(body: Body, action: Action, luck: Luck) -> Skill:
     yield from body.touch(arm, reach.at, body.part_geoms(thing, "toggle"), speed=0.7)
     yield from wait(0.1)
     gap = body.probe.hand_gap_m(arm, body.part_geoms(thing, "toggle"))
-    outcome = luck(action)
+    outcome = outcome_draw(action)
     if gap <= GRASP_GAP_M and outcome == "success":
-        body.world.set_state(thing.object_id, "isToggled", action.name == "ToggleOn")
+        body.world.states.set_state(thing.object_id, "isToggled", action.name == "ToggleOn")
     yield from body.move_arm(arm, [reach.before])
     yield from body.move_hand(arm, 1.0, 0.2)
     yield from stow(body, arm)

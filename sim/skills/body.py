@@ -139,7 +139,7 @@ class Body:
         self._hand_joints = np.array([int(model.joint(n).id) for arm in Arm for n in self.spec.arms[arm.value].hand_joints])
         sliding = model.jnt_type[self._hand_joints] == int(mujoco.mjtJoint.mjJNT_SLIDE)
         self._hand_scale = np.where(sliding, 0.2, 1.0)
-        self._mine = np.where(np.isin(model.geom_bodyid, list(world.robot_body_ids)), 1, -1)
+        self._mine = np.where(np.isin(model.geom_bodyid, list(world.scene.robot_bodies)), 1, -1)
         self._columns = {arm: kit.model.indices(self.spec.arms[arm.value].joints) for arm in Arm}
         self.hypothesis = Hypothesis()
         self._vias: dict[Arm, tuple[Array, ...]] = {}
@@ -179,7 +179,7 @@ class Body:
 
     def base(self) -> Stance:
         """Where the base is."""
-        x, y, _, yaw = self.world.base_pose[:4]
+        x, y, _, yaw = self.world.servos.base_pose[:4]
         return Stance(float(x), float(y), float(yaw))
 
     def commanded_base(self) -> Stance:
@@ -197,7 +197,7 @@ class Body:
 
     def base_error_m(self) -> float:
         """Distance between commanded and actual base, the heading weighed with 0.3 m per radian."""
-        x, y, z, yaw = self.world.data.ctrl[self._base[:4]] - self.world.base_pose[:4]
+        x, y, z, yaw = self.world.data.ctrl[self._base[:4]] - self.world.servos.base_pose[:4]
         return float(np.sqrt(x * x + y * y + z * z + (0.3 * yaw) ** 2))
 
     def command_base(self, x: float, y: float, yaw_rad: float) -> None:
@@ -206,7 +206,7 @@ class Body:
 
     def command_height(self, pelvis_height_m: float) -> None:
         """Sets the pelvis height and the legs that go with it."""
-        self.world.command_height(pelvis_height_m)
+        self.world.servos.command_height(pelvis_height_m)
 
     def command_legs(self, joints: Array) -> None:
         """Sets the leg joints' targets (L,)."""
@@ -304,7 +304,7 @@ class Body:
     def part_geoms(self, thing: ObjectInstance, option: str) -> NDArray[np.int64]:
         """Geoms of an object's parts with a catalogue option, such as `handle` or `toggle`."""
         return np.array(
-            [geom for geom, part in self.world.part_of_geom[thing.object_id] if option in part.options], dtype=np.int64
+            [geom for geom, part in self.world.scene.part_of_geom[thing.object_id] if option in part.options], dtype=np.int64
         )
 
     def interaction_point(self, object_id: str) -> Array:
@@ -326,13 +326,13 @@ class Body:
         """World directions out of an object in which a robot stands well: square to what carries it, or to its own sides."""
         thing = self.thing(object_id)
         square = thing
-        if thing.movable and not self.world.needs_two_hands(object_id):
-            carriers = self.world.parents(object_id)
+        if thing.movable and not self.world.containment.needs_two_hands(object_id):
+            carriers = self.world.containment.parents(object_id)
             if not carriers:
                 return ()
             square = self.thing(carriers[-1])
         # a tap may stand beside its basin, which is used from the basin's front
-        front = self.world.front(self.world.room.links.get(square.object_id, square.object_id))
+        front = self.world.poses.front(self.world.room.links.get(square.object_id, square.object_id))
         angle = float(np.arctan2(front[1], front[0]))
         sides = square.movable or any(surface.spec.all_sides for surface in square.surfaces)
         return tuple(angle + k * np.pi / 2.0 for k in range(4)) if sides else (angle,)
@@ -340,7 +340,7 @@ class Body:
     def rests(self, thing: ObjectInstance) -> bool:
         """Whether an object touches something that is not part of the robot, from above."""
         data, mine = self.world.data, set(map(int, thing.geom_ids))
-        owner = self.world.object_of_geom
+        owner = self.world.scene.object_of_geom
         for contact in data.contact[: data.ncon]:
             a, b = int(contact.geom1), int(contact.geom2)
             other = b if a in mine else a if b in mine else -1
@@ -367,7 +367,7 @@ class Body:
                 (0.15, 0.0),
             ):
                 near = easy[:2] + self.turn_to_world(np.array([dx, dy, 0.0]))[:2]
-                spot = self.world.free_spot(
+                spot = self.world.containment.free_spot(
                     receptacle.object_id, radius, height_m=thing.height_m, near=near, gap_m=gap,
                     ignore=(thing.object_id,), band_m=10.0,
                 )  # fmt: skip

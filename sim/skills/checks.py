@@ -11,7 +11,6 @@ from data.interface.failures import FailureCode
 from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body
 from sim.skills.failures import SkillFailure
-from sim.world.liquids import capacity_l, spout
 
 __all__ = [
     "check_clean",
@@ -31,7 +30,7 @@ __all__ = [
 
 def _check_accessible(body: Body, thing: ObjectInstance) -> None:
     """Refuses objects that are shut away."""
-    for name in body.world.parents(thing.object_id):
+    for name in body.world.containment.parents(thing.object_id):
         if body.thing(name).is_shut:
             raise SkillFailure(FailureCode.RECEPTACLE_CLOSED)
 
@@ -51,8 +50,8 @@ def check_pick(body: Body, arm: Arm, thing: ObjectInstance) -> None:
     if not thing.movable:
         raise SkillFailure(FailureCode.NOT_PICKUPABLE)
     limit = body.spec.arms[arm.value].max_load_kg
-    mass = body.world.total_mass_kg(thing.object_id)
-    if body.world.needs_two_hands(thing.object_id):
+    mass = body.world.containment.total_mass_kg(thing.object_id)
+    if body.world.containment.needs_two_hands(thing.object_id):
         if mass > body.spec.two_arm_max_load_kg:
             raise SkillFailure(FailureCode.TOO_HEAVY, {"mass_kg": mass - body.spec.two_arm_max_load_kg})
         raise SkillFailure(FailureCode.NEEDS_TWO_HANDS, {"mass_kg": mass - limit})
@@ -132,7 +131,9 @@ def check_hold(body: Body, arm: Arm, thing: ObjectInstance) -> None:
 
 def _check_steady(body: Body, arm: Arm, thing: ObjectInstance) -> None:
     """Refuses to work on what would roll or slide away, unless the other hand holds it where it rests."""
-    if thing.type.has("unsteady") and not (arm.other.value in thing.held_by and body.world.parents(thing.object_id)):
+    if thing.type.has("unsteady") and not (
+        arm.other.value in thing.held_by and body.world.containment.parents(thing.object_id)
+    ):
         raise SkillFailure(FailureCode.NEEDS_STEADYING)
 
 
@@ -190,7 +191,7 @@ def check_pour(body: Body, arm: Arm, target: ObjectInstance) -> ObjectInstance:
         raise SkillFailure(FailureCode.OBJECT_BROKEN)
     if arm.other.value in target.held_by:
         raise SkillFailure(FailureCode.IN_USE)
-    if target.state.fillLitres >= 0.999 * capacity_l(target.type):
+    if target.state.fillLitres >= 0.999 * target.type.volume_l:
         raise SkillFailure(FailureCode.ALREADY_IN_STATE)
     _check_accessible(body, target)
     return vessel
@@ -203,11 +204,11 @@ def check_fill(body: Body, arm: Arm, source: ObjectInstance) -> tuple[ObjectInst
         raise SkillFailure(FailureCode.NEEDS_TOOL)
     if vessel.is_broken:
         raise SkillFailure(FailureCode.OBJECT_BROKEN)
-    if vessel.state.fillLitres >= 0.999 * capacity_l(vessel.type):
+    if vessel.state.fillLitres >= 0.999 * vessel.type.volume_l:
         raise SkillFailure(FailureCode.ALREADY_IN_STATE)
     taps = [name for name, basin in body.world.room.links.items() if basin == source.object_id]
-    outlet = body.thing(taps[0]) if taps and spout(body.world, source) is None else source
-    if spout(body.world, outlet) is None:
+    outlet = body.thing(taps[0]) if taps and body.world.liquids.spout(source) is None else source
+    if body.world.liquids.spout(outlet) is None:
         raise SkillFailure(FailureCode.NOT_FILLABLE)
     if not outlet.is_toggled:
         raise SkillFailure(FailureCode.SOURCE_OFF)
@@ -222,10 +223,10 @@ def check_lift(body: Body, thing: ObjectInstance) -> None:
         raise SkillFailure(FailureCode.HAND_OCCUPIED)
     if not thing.movable:
         raise SkillFailure(FailureCode.NOT_LIFTABLE)
-    mass = body.world.total_mass_kg(thing.object_id)
+    mass = body.world.containment.total_mass_kg(thing.object_id)
     if mass > body.spec.two_arm_max_load_kg:
         raise SkillFailure(FailureCode.TOO_HEAVY, {"mass_kg": mass - body.spec.two_arm_max_load_kg})
-    if not body.world.needs_two_hands(thing.object_id) and max(thing.type.size[:2]) < 0.2:
+    if not body.world.containment.needs_two_hands(thing.object_id) and max(thing.type.size[:2]) < 0.2:
         raise SkillFailure(FailureCode.NOT_LIFTABLE)
     _check_accessible(body, thing)
 

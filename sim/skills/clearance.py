@@ -213,7 +213,7 @@ class ClearanceProbe:
     def _cargo(self, arm: Arm) -> _Cargo | None:
         """What the arm alone holds, as it lies in the hand now."""
         world = self._world
-        name = world.held(arm.value)
+        name = world.grasps.held(arm.value)
         thing = None if name is None else world.objects[name]
         if thing is None or not thing.movable or len(thing.held_by) != 1:
             return None
@@ -236,8 +236,8 @@ class ClearanceProbe:
         scratch.qpos[:] = world.data.qpos
         place, turn = slice(thing.qpos_adr, thing.qpos_adr + 3), slice(thing.qpos_adr + 3, thing.qpos_adr + 7)
         load = np.isin(np.arange(model.ngeom), thing.geom_ids)
-        barred = ~np.isin(model.geom_bodyid, list(world.robot_body_ids))
-        for name in (thing.object_id, *world.contents(thing.object_id)):
+        barred = ~np.isin(model.geom_bodyid, list(world.scene.robot_bodies))
+        for name in (thing.object_id, *world.containment.contents(thing.object_id)):
             barred[world.objects[name].geom_ids] = False
         depths: list[float] = []
         for pose in poses:

@@ -89,14 +89,14 @@ class _Shape:
 
 
 def _shape(body: Body, thing: ObjectInstance) -> _Shape:
-    pose = body.world.pose(thing.object_id)
+    pose = body.world.poses.pose(thing.object_id)
     rotation = pose[:3, :3]
     low, high = solid_box(thing)
     center = pose[:3, 3] + rotation @ (0.5 * (low + high))
     half = 0.5 * (high - low)
     rise = float(np.abs(rotation[2]) @ half)
     has_grip = "single" in thing.type.grips
-    grip = body.world.grips(thing.object_id)[0] if has_grip else center
+    grip = body.world.poses.grips(thing.object_id)[0] if has_grip else center
     return _Shape(center, rotation, half, float(center[2]) - rise, float(center[2]) + rise, grip, has_grip)
 
 

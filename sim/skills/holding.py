@@ -14,7 +14,7 @@ from sim.skills.body import Body, wait
 from sim.skills.checks import check_hold
 from sim.skills.failures import SkillFailure
 from sim.skills.grasps import Grasp
-from sim.skills.manipulate import GRASP_GAP_M, Luck, grip, plan_pick, retreat, stow
+from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, grip, plan_pick, retreat, stow
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
 from sim.skills.reach_map import HandPose
@@ -36,7 +36,7 @@ def assess_hold(body: Body, action: Action) -> tuple[Grasp | None, Reach]:
     return plan_pick(body, action.arm, thing) if thing.movable else (None, plan_handle(body, action.arm, thing))
 
 
-def hold(body: Body, action: Action, luck: Luck) -> Skill:
+def hold(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Hold: takes hold of an object or a handle and stays there.
 
     Raises:
@@ -56,7 +56,7 @@ def hold(body: Body, action: Action, luck: Luck) -> Skill:
         yield from body.move_arm(arm, [reach.at], speed=0.8)
         yield from body.move_hand(arm, 0.35, 0.3)
         gap = body.probe.hand_gap_m(arm, body.part_geoms(thing, "handle"))
-    outcome = luck(action)
+    outcome = outcome_draw(action)
     if gap > GRASP_GAP_M or thing.held_by or outcome != "success":
         taken = bool(thing.held_by)
         yield from retreat(body, arm, reach, name)
@@ -65,23 +65,23 @@ def hold(body: Body, action: Action, luck: Luck) -> Skill:
         if taken:
             raise SkillFailure(FailureCode.ALREADY_HELD)
         raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
-    body.world.attach(arm.value, thing.object_id)
+    body.world.grasps.attach(arm.value, thing.object_id)
 
 
-def release(body: Body, action: Action, luck: Luck) -> Skill:
+def release(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Release: opens the hand and draws the arm back; what it held stays or falls.
 
     Raises:
         SkillFailure: HandEmpty.
     """
-    del luck
+    del outcome_draw
     arm = action.arm
     assert arm is not None
     name = body.held[arm] if body.lifted is None else body.lifted
     if name is None:
         raise SkillFailure(FailureCode.HAND_EMPTY)
     thing = body.thing(name)
-    body.world.detach(arm.value)
+    body.world.grasps.detach(arm.value)
     yield from body.move_hand(arm, 1.0)
     position, hand = body.hand_pose(arm)
     back = body.solve(arm, HandPose(position - 0.08 * hand[:, 0], hand[:, 0], hand[:, 1]), start=body.commanded_arm(arm))
@@ -90,6 +90,6 @@ def release(body: Body, action: Action, luck: Luck) -> Skill:
     yield from stow(body, arm, (name,))
     yield from wait(0.1)
     for _ in range(int((3.0 if thing.self_closing else 1.0) / CONTROL_DT_S)):
-        if body.world.speed_of(thing.object_id) < 0.02 and not (thing.self_closing and thing.openness > 0.02):
+        if body.world.poses.speed_m_s(thing.object_id) < 0.02 and not (thing.self_closing and thing.openness > 0.02):
             break
         yield

@@ -27,10 +27,9 @@ from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach, diagnose, diagnosed, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill
-from sim.world.liquids import spill
 
 __all__ = [
-    "Luck",
+    "OutcomeDraw",
     "grip",
     "nudge",
     "pick",
@@ -47,7 +46,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 #: Draws the contingency of an action on an object.
-Luck = Callable[[Action], str]
+OutcomeDraw = Callable[[Action], str]
 
 GRASP_GAP_M: Final = 0.015
 _APPROACH_M: Final = 0.09
@@ -77,7 +76,7 @@ def plan_pick(body: Body, arm: Arm, thing: ObjectInstance) -> tuple[Grasp, Reach
         if _find_grasp(body, arm, thing, _MAX_PLANS // 3) is None:
             raise SkillFailure(FailureCode.OBSTRUCTED)
 
-    raise diagnose(body, {arm: body.world.grips(thing.object_id)[0]}, elsewhere)
+    raise diagnose(body, {arm: body.world.poses.grips(thing.object_id)[0]}, elsewhere)
 
 
 def _find_grasp(
@@ -127,7 +126,7 @@ def _carry(body: Body, arm: Arm, held: str) -> Array:
     """
     usual = body.carrying(arm)
     _, hand = body.hand_pose(arm)
-    turn = upright(body.world.pose(held)[:3, :3])
+    turn = upright(body.world.poses.pose(held)[:3, :3])
     pointing, closing = turn @ hand[:, 0], turn @ hand[:, 1]
     ahead = body.turn_to_world(np.array([1.0, 0.0, 0.0]))
     if np.hypot(*pointing[:2]) > 0.15:
@@ -136,7 +135,7 @@ def _carry(body: Body, arm: Arm, held: str) -> Array:
     place_at = body.hand_at(arm, usual)
     solved = body.solve(arm, HandPose(place_at, pointing, closing), start=usual, roll_weight=0.2)
     if body.thing(held).state.fillLitres > 0.0:
-        up = hand.T @ body.world.pose(held)[:3, 2]
+        up = hand.T @ body.world.poses.pose(held)[:3, 2]
         return _level(body, arm, up, place_at, pointing, closing, solved.q if solved.error_m < 0.05 else usual)
     return solved.q if solved.error_m < 0.05 else usual
 
@@ -145,7 +144,7 @@ def _level_way(body: Body, arm: Arm, held: str, goal: Array) -> list[Array]:
     """(A,) postures on the hand's straight way to carrying on which a vessel stays upright, as far as they exist."""
     start, end = body.hand_pose(arm)[0], body.hand_at(arm, goal)
     hand = body.hand_pose(arm)[1]
-    turn = upright(body.world.pose(held)[:3, :3])
+    turn = upright(body.world.poses.pose(held)[:3, :3])
     pointing, closing = turn @ hand[:, 0], turn @ hand[:, 1]
     way: list[Array] = []
     last = body.commanded_arm(arm)
@@ -209,7 +208,7 @@ def retreat(body: Body, arm: Arm, reach: Reach, ignore: tuple[str | int, ...]) -
     yield from stow(body, arm, ignore)
 
 
-def pick(body: Body, action: Action, luck: Luck) -> Skill:
+def pick(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Pick: takes an object with one hand and carries it before the body.
 
     Raises:
@@ -237,8 +236,8 @@ def pick(body: Body, action: Action, luck: Luck) -> Skill:
     if thing.held_by:
         yield from retreat(body, arm, reach, name)
         raise SkillFailure(FailureCode.ALREADY_HELD)
-    outcome = luck(action)
-    body.world.attach(arm.value, thing.object_id)
+    outcome = outcome_draw(action)
+    body.world.grasps.attach(arm.value, thing.object_id)
     yield from _lift(body, arm)
     if outcome != "success":
         yield from _bad_luck(body, arm, thing, outcome)
@@ -270,11 +269,11 @@ def _bad_luck(body: Body, arm: Arm, thing: ObjectInstance, outcome: str) -> Skil
     """Acts out a contingency of Pick: the object leaves the hand, and may break or lose its liquid."""
     codes = {"slipped": FailureCode.SLIPPED, "spilled": FailureCode.SPILLED, "broken": FailureCode.BROKE}
     code = codes.get(outcome, FailureCode.NOTHING_HAPPENED)
-    body.world.detach(arm.value)
+    body.world.grasps.detach(arm.value)
     if outcome in ("spilled", "broken"):
-        spill(body.world, thing)
+        body.world.liquids.spill(thing)
     if outcome == "broken" and thing.type.has("breakable"):
-        body.world.set_state(thing.object_id, "isBroken", True)
+        body.world.states.set_state(thing.object_id, "isBroken", True)
     yield from body.move_hand(arm, 1.0)
     yield from wait(0.3)
     yield from stow(body, arm, (thing.object_id,))
@@ -300,7 +299,7 @@ def plan_place(body: Body, arm: Arm, thing: ObjectInstance, receptacle: ObjectIn
 def _rim_m(body: Body, receptacle: ObjectInstance) -> float:
     """World height of the rim of a drawer, box or vessel that is filled from above; minus infinity for other receptacles."""
     data, model = body.world.data, body.world.model
-    parts = body.world.part_of_geom[receptacle.object_id]
+    parts = body.world.scene.part_of_geom[receptacle.object_id]
     hollow = {int(model.geom_bodyid[geom]) for geom, part in parts if part.shape in ("tray", "cup")}
     around = [geom for geom, _ in parts if int(model.geom_bodyid[geom]) in hollow and model.geom_contype[geom] > 0]
     halves = [float(np.abs(data.geom_xmat[geom].reshape(3, 3)[2]) @ model.geom_aabb[geom, 3:]) for geom in around]
@@ -338,7 +337,7 @@ def plan_bring(
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
     position, hand = body.hand_pose(arm)
-    pose = body.world.pose(thing.object_id)
+    pose = body.world.poses.pose(thing.object_id)
     # the object upright again, turned about the vertical only
     tilt = upright(pose[:3, :3])
     middle = pose[:3, 3] if point is None else pose[:3, 3] + pose[:3, :3] @ point
@@ -367,7 +366,7 @@ def plan_bring(
     return diagnosed(body, {arm: spots[0] + lift - offset}, search)
 
 
-def place(body: Body, action: Action, luck: Luck) -> Skill:
+def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Place: puts the held object down on a free spot of a receptacle.
 
     Raises:
@@ -377,12 +376,12 @@ def place(body: Body, action: Action, luck: Luck) -> Skill:
     arm = action.arm
     assert arm is not None and action.object_id is not None
     receptacle, thing = body.thing(action.object_id), body.thing(body.held[arm] or "")
-    outcome = luck(action)
+    outcome = outcome_draw(action)
     name = (thing.object_id,)
     yield from body.move_arm(arm, [*reach.way, reach.before])
     if outcome in ("nothing", "spilled"):
         if outcome == "spilled":
-            spill(body.world, thing)
+            body.world.liquids.spill(thing)
         yield from stow(body, arm, name)
         raise SkillFailure(FailureCode.SPILLED if outcome == "spilled" else FailureCode.NOTHING_HAPPENED, contingency=outcome)
     lowering = body.move_arm(arm, [reach.at], speed=0.6)
@@ -392,20 +391,20 @@ def place(body: Body, action: Action, luck: Luck) -> Skill:
             break
     yield from wait(0.04)
     if outcome == "broken" and thing.type.has("breakable"):
-        body.world.set_state(thing.object_id, "isBroken", True)
-    body.world.detach(arm.value)
+        body.world.states.set_state(thing.object_id, "isBroken", True)
+    body.world.grasps.detach(arm.value)
     yield from body.move_hand(arm, 1.0)
     position, hand = body.hand_pose(arm)
     back = body.solve(arm, HandPose(position + 0.09 * away, hand[:, 0], hand[:, 1]), start=body.commanded_arm(arm))
     yield from body.move_arm(arm, [back.q if back.error_m < 0.03 else reach.before])
     yield from stow(body, arm)
     for _ in range(int(1.0 / CONTROL_DT_S)):
-        if body.world.speed_of(thing.object_id) < 0.02:
+        if body.world.poses.speed_m_s(thing.object_id) < 0.02:
             break
         yield
     if outcome == "broken":
         raise SkillFailure(FailureCode.BROKE, contingency=outcome)
-    if receptacle.object_id not in body.world.parents(thing.object_id):
+    if receptacle.object_id not in body.world.containment.parents(thing.object_id):
         gap = float(np.linalg.norm(body.world_position(thing.object_id) - body.world_position(receptacle.object_id)))
         raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})
 
@@ -435,13 +434,13 @@ def assess_place(body: Body, action: Action) -> tuple[Array, Reach, Array]:
     return plan_place(body, action.arm, check_place(body, action.arm, receptacle), receptacle)
 
 
-def reset_arm(body: Body, action: Action, luck: Luck) -> Skill:
+def reset_arm(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """ResetArm: back to the ready posture, with the hand open unless it holds something.
 
     Raises:
         SkillFailure: BothHandsBusy, or InUse for a hand that is at a door or drawer.
     """
-    del luck
+    del outcome_draw
     assert action.arm is not None
     if body.lifted is not None:
         raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)

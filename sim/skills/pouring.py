@@ -21,11 +21,11 @@ from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_fill, check_pour
 from sim.skills.failures import SkillFailure
-from sim.skills.manipulate import Luck, nudge, plan_bring, stow
+from sim.skills.manipulate import OutcomeDraw, nudge, plan_bring, stow
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
 from sim.skills.runner import CONTROL_DT_S, Skill
-from sim.world import liquids
+from sim.world.liquids import STEEP, opening_radius_m
 
 __all__ = ["assess_fill", "assess_pour", "fill", "pour"]
 
@@ -44,9 +44,9 @@ _CENTRED_M: Final = 0.015
 def _opening(body: Body, thing: ObjectInstance) -> tuple[Array, float]:
     """(3,) middle of a vessel's opening in the world, and its radius in metres."""
     middle = 0.5 * (thing.local_min + thing.local_max)
-    pose = body.world.pose(thing.object_id)
+    pose = body.world.poses.pose(thing.object_id)
     top = pose[:3, 3] + pose[:3, :3] @ np.array([middle[0], middle[1], thing.local_max[2]])
-    return top, liquids.opening_radius_m(thing)
+    return top, opening_radius_m(thing)
 
 
 @cached_plan
@@ -101,7 +101,7 @@ def _pose_at(body: Body, arm: Arm, vessel: ObjectInstance, q: Array, turn: float
     """(4, 4) pose of the held vessel for an arm posture with its last joint turned on, from the commanded base."""
     scratch, model = mujoco.MjData(body.world.model), body.world.model
     scratch.qpos[:] = body.world.data.qpos
-    offset = np.linalg.inv(body.world.grasp_pose(arm.value)) @ body.world.pose(vessel.object_id)
+    offset = np.linalg.inv(body.world.servos.grasp_pose(arm.value)) @ body.world.poses.pose(vessel.object_id)
     for joint, value in zip(body.spec.arms[arm.value].joints, [*q[:-1], q[-1] + turn], strict=True):
         scratch.qpos[model.joint(joint).qposadr[0]] = value
     mujoco.mj_kinematics(model, scratch)
@@ -117,13 +117,13 @@ def _lands(body: Body, arm: Arm, vessel: ObjectInstance, q: Array, turn: float, 
     for share in _SHARES:
         pose = _pose_at(body, arm, vessel, q, share * turn)
         tilt = float(np.arccos(np.clip(pose[2, 2], -1.0, 1.0)))
-        rim = liquids.rim(body.world, vessel, pose)
-        if pose[2, 2] < liquids.STEEP and (float(np.hypot(*(rim[:2] - top[:2]))) > radius or rim[2] < top[2]):
+        rim = body.world.liquids.rim(vessel, pose)
+        if pose[2, 2] < STEEP and (float(np.hypot(*(rim[:2] - top[:2]))) > radius or rim[2] < top[2]):
             return False
     return tilt >= _TILT_RAD
 
 
-def pour(body: Body, action: Action, luck: Luck) -> Skill:
+def pour(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Pour: pours from the vessel in the hand into another one, or into a basin, until the first is empty or the second full.
 
     Raises:
@@ -133,15 +133,15 @@ def pour(body: Body, action: Action, luck: Luck) -> Skill:
     arm = action.arm
     assert arm is not None and action.object_id is not None
     target, vessel = body.thing(action.object_id), body.thing(body.held[arm] or "")
-    outcome = luck(action)
+    outcome = outcome_draw(action)
     yield from body.move_arm(arm, [*reach.way, reach.before])
     yield from body.move_arm(arm, [reach.at], speed=0.6)
     tilted = reach.at.copy()
     tilted[-1] += turn
     if outcome != "success":
-        liquids.spill(body.world, vessel)
+        body.world.liquids.spill(vessel)
     before, had = target.state.fillLitres, vessel.state.fillLitres
-    full = 0.999 * liquids.capacity_l(target.type)
+    full = 0.999 * target.type.volume_l
     pouring = body.move_arm(arm, [tilted], speed=0.35)
     for _ in range(int(_LONGEST_S / CONTROL_DT_S)):
         next(pouring, None)  # then the arm stays as it is commanded
@@ -168,7 +168,7 @@ def assess_fill(body: Body, action: Action) -> Reach:
     assert action.arm is not None and action.object_id is not None
     source = body.thing(action.object_id)
     vessel, outlet = check_fill(body, action.arm, source)
-    point = liquids.spout(body.world, outlet)
+    point = body.world.liquids.spout(outlet)
     assert point is not None
     height = float(vessel.local_max[2] - vessel.local_min[2])
     spots = [point - (0.0, 0.0, height + gap) for gap in (0.03, 0.06, 0.01)]
@@ -179,7 +179,7 @@ def assess_fill(body: Body, action: Action) -> Reach:
     return plan_bring(body, action.arm, vessel, spots, names, above_m=0.0, coming_from=aside)[1]
 
 
-def fill(body: Body, action: Action, luck: Luck) -> Skill:
+def fill(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Fill: holds the vessel in the hand below a running tap or coffee machine until it is full.
 
     Raises:
@@ -189,14 +189,14 @@ def fill(body: Body, action: Action, luck: Luck) -> Skill:
     arm = action.arm
     assert arm is not None and action.object_id is not None
     vessel, outlet = check_fill(body, arm, body.thing(action.object_id))
-    outcome = luck(action)
+    outcome = outcome_draw(action)
     before = vessel.state.fillLitres
     yield from body.move_arm(arm, [*reach.way, reach.before])
     yield from body.move_arm(arm, [reach.at], speed=0.6)
-    full = 0.999 * liquids.capacity_l(vessel.type)
+    full = 0.999 * vessel.type.volume_l
     for _ in range(_CORRECTIONS):
         yield from wait(0.1)
-        point, (top, _) = liquids.spout(body.world, outlet), _opening(body, vessel)
+        point, (top, _) = body.world.liquids.spout(outlet), _opening(body, vessel)
         assert point is not None
         aside = np.array([point[0] - top[0], point[1] - top[1], 0.0])
         if float(np.hypot(aside[0], aside[1])) < _CENTRED_M:
@@ -207,7 +207,7 @@ def fill(body: Body, action: Action, luck: Luck) -> Skill:
             break
         yield
     if outcome == "spilled":
-        liquids.spill(body.world, vessel)
+        body.world.liquids.spill(vessel)
     yield from wait(0.1)
     yield from body.move_arm(arm, [reach.before])
     yield from stow(body, arm, (vessel.object_id,))

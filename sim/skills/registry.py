@@ -10,7 +10,7 @@ from data.interface.steps import Action, PlanStep
 from sim.skills import articulate, holding, locomotion, manipulate, pouring, set_down, tools, two_arm
 from sim.skills.body import Body
 from sim.skills.failures import SkillFailure
-from sim.skills.manipulate import Luck
+from sim.skills.manipulate import OutcomeDraw
 from sim.skills.push import Push
 from sim.skills.runner import Skill, refuse
 
@@ -30,7 +30,7 @@ BODY_SKILLS: Final[Mapping[str, Callable[[Body, Action], Skill]]] = {
 }
 
 #: Skills of one or both arms.
-ARM_SKILLS: Final[Mapping[str, Callable[[Body, Action, Luck], Skill]]] = {
+ARM_SKILLS: Final[Mapping[str, Callable[[Body, Action, OutcomeDraw], Skill]]] = {
     "Pick": manipulate.pick,
     "Place": manipulate.place,
     "ResetArm": manipulate.reset_arm,
@@ -50,7 +50,7 @@ ARM_SKILLS: Final[Mapping[str, Callable[[Body, Action, Luck], Skill]]] = {
 }
 
 
-def skills_for(body: Body, step: PlanStep, known: frozenset[str], luck: Luck) -> list[tuple[Action, Skill]]:
+def skills_for(body: Body, step: PlanStep, known: frozenset[str], outcome_draw: OutcomeDraw) -> list[tuple[Action, Skill]]:
     """The coroutines of a plan step, in its order; what is refused at once is a coroutine that fails at once."""
     conflict = excludes(body, step, known)
     skills: list[tuple[Action, Skill]] = []
@@ -64,7 +64,7 @@ def skills_for(body: Body, step: PlanStep, known: frozenset[str], luck: Luck) ->
         elif action.name in BODY_SKILLS:
             skills.append((action, BODY_SKILLS[action.name](body, action)))
         else:
-            skills.append((action, ARM_SKILLS[action.name](body, action, luck)))
+            skills.append((action, ARM_SKILLS[action.name](body, action, outcome_draw)))
     return skills
 
 

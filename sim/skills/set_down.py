@@ -24,7 +24,7 @@ from sim.skills.body import Body, BothGoal, wait
 from sim.skills.checks import check_place_both
 from sim.skills.clearance import TOUCH_M
 from sim.skills.failures import SkillFailure
-from sim.skills.manipulate import Luck, upright
+from sim.skills.manipulate import OutcomeDraw, upright
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import diagnose
 from sim.skills.reach_map import HandPose
@@ -136,9 +136,9 @@ class _Load:
     @classmethod
     def of(cls, body: Body, thing: ObjectInstance) -> _Load:
         """What is held now."""
-        pose = body.world.pose(thing.object_id)
+        pose = body.world.poses.pose(thing.object_id)
         hands = {arm: _pose(*body.hand_pose(arm)) for arm in Arm}
-        bottom_m = float(body.world.bounds(thing.object_id)[0][2])
+        bottom_m = float(body.world.poses.bounds(thing.object_id)[0][2])
         turned, sole_m = pose, float(pose[2, 3]) - bottom_m
         if float(np.arccos(np.clip(pose[2, 2], -1.0, 1.0))) > _LEANING_RAD:
             middle = 0.5 * (hands[Arm.LEFT][:3, 3] + hands[Arm.RIGHT][:3, 3])
@@ -214,10 +214,10 @@ def _between(start: Array, end: Array) -> list[Array]:
 
 def _under_m(body: Body, thing: ObjectInstance, placement: BothPlacement) -> float:
     """How far a load's lowest point is below the surface that it is brought to, negative above it."""
-    return placement.surface_m - float(body.world.bounds(thing.object_id)[0][2])
+    return placement.surface_m - float(body.world.poses.bounds(thing.object_id)[0][2])
 
 
-def place_both(body: Body, action: Action, luck: Luck) -> Skill:
+def place_both(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """PlaceBoth: puts down what both hands hold, straight up first and then over the receptacle's edge.
 
     Raises:
@@ -242,7 +242,7 @@ def place_both(body: Body, action: Action, luck: Luck) -> Skill:
             yield from body.move_both([hold], speed=0.6)
             raise SkillFailure(FailureCode.BODY_TOO_LOW, {"height_m": under_m + _EDGE_M})
     yield from body.move_both([placement.above], speed=0.6)
-    outcome = luck(action)
+    outcome = outcome_draw(action)
     if outcome != "success":
         yield from body.move_both([*first, hold], speed=0.6)
         raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
@@ -252,7 +252,7 @@ def place_both(body: Body, action: Action, luck: Luck) -> Skill:
             break
     yield from wait(0.1)
     for arm in Arm:
-        body.world.detach(arm.value)
+        body.world.grasps.detach(arm.value)
     wishes = {}
     outward = body.turn_to_world(np.array([0.0, 1.0, 0.0]))
     for arm, sign in ((Arm.LEFT, 1.0), (Arm.RIGHT, -1.0)):
@@ -262,9 +262,9 @@ def place_both(body: Body, action: Action, luck: Luck) -> Skill:
     yield from body.move_both([apart], speed=0.6)
     yield from body.stow_both()
     for _ in range(int(0.6 / CONTROL_DT_S)):
-        if body.world.speed_of(thing.object_id) < 0.02:
+        if body.world.poses.speed_m_s(thing.object_id) < 0.02:
             break
         yield
-    if receptacle.object_id not in body.world.parents(thing.object_id):
+    if receptacle.object_id not in body.world.containment.parents(thing.object_id):
         gap = float(np.linalg.norm(body.world_position(thing.object_id) - body.world_position(receptacle.object_id)))
         raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})

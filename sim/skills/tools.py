@@ -21,11 +21,10 @@ from sim.skills.articulate import plan_press
 from sim.skills.body import Body, wait
 from sim.skills.checks import check_clean, check_slice, check_use_up
 from sim.skills.failures import SkillFailure
-from sim.skills.manipulate import GRASP_GAP_M, Luck, nudge, plan_bring, stow
+from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, nudge, plan_bring, stow
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
 from sim.skills.runner import Skill
-from sim.world.liquids import wipe
 
 __all__ = ["assess_clean", "assess_slice", "assess_use_up", "clean", "slice_object", "use_up"]
 
@@ -39,7 +38,7 @@ _PRESS_STEPS: Final = 3
 
 def _top(body: Body, thing: ObjectInstance) -> Array:
     """(3,) world point in the middle of an object's upper side."""
-    low, high = body.world.bounds(thing.object_id)
+    low, high = body.world.poses.bounds(thing.object_id)
     return np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, high[2]])
 
 
@@ -58,7 +57,7 @@ def assess_slice(body: Body, action: Action) -> Reach:
     assert action.arm is not None and action.object_id is not None
     thing = body.thing(action.object_id)
     tool = check_slice(body, action.arm, thing)
-    names = (tool.object_id, thing.object_id, *body.world.parents(thing.object_id)[:1])
+    names = (tool.object_id, thing.object_id, *body.world.containment.parents(thing.object_id)[:1])
     return plan_bring(body, action.arm, tool, [_top(body, thing)], names, point=_blade(tool), above_m=0.002)[1]
 
 
@@ -93,17 +92,21 @@ def assess_use_up(body: Body, action: Action) -> Reach:
     return plan_press(body, action.arm, _top(body, thing) - (0.0, 0.0, 0.01), (thing.object_id,))
 
 
-def slice_object(body: Body, action: Action, luck: Luck) -> Skill:
+def slice_object(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Slice: draws the knife in the hand through an object.
 
     Raises:
         SkillFailure: what `assess_slice` refuses, ToolMissed, or a contingency.
     """
     reach = assess_slice(body, action)
-    yield from _apply(body, action, reach, luck, lambda thing: body.world.set_state(thing.object_id, "isSliced", True))
+
+    def effect(item: ObjectInstance) -> None:
+        body.world.states.set_state(item.object_id, "isSliced", True)
+
+    yield from _apply(body, action, reach, outcome_draw, effect)
 
 
-def clean(body: Body, action: Action, luck: Luck) -> Skill:
+def clean(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Clean: wipes an object, or what is spilled on it, with the sponge or towel in the hand.
 
     Raises:
@@ -112,14 +115,14 @@ def clean(body: Body, action: Action, luck: Luck) -> Skill:
     reach = assess_clean(body, action)
 
     def effect(thing: ObjectInstance) -> None:
-        wipe(body.world, thing.object_id)
+        body.world.liquids.wipe(thing.object_id)
         if thing.state.isDirty:
-            body.world.set_state(thing.object_id, "isDirty", False)
+            body.world.states.set_state(thing.object_id, "isDirty", False)
 
-    yield from _apply(body, action, reach, luck, effect)
+    yield from _apply(body, action, reach, outcome_draw, effect)
 
 
-def use_up(body: Body, action: Action, luck: Luck) -> Skill:
+def use_up(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """UseUp: takes what is left of a roll, a box of tissues or a bottle of soap with the empty hand.
 
     Raises:
@@ -133,9 +136,9 @@ def use_up(body: Body, action: Action, luck: Luck) -> Skill:
     yield from body.touch(arm, reach.at, body.solid_geoms(thing), speed=0.7)
     yield from wait(0.1)
     gap = body.probe.hand_gap_m(arm, body.solid_geoms(thing))
-    outcome = luck(action)
+    outcome = outcome_draw(action)
     if gap <= GRASP_GAP_M and outcome == "success":
-        body.world.set_state(thing.object_id, "isUsedUp", True)
+        body.world.states.set_state(thing.object_id, "isUsedUp", True)
     yield from body.move_arm(arm, [reach.before])
     yield from body.move_hand(arm, 1.0, 0.2)
     yield from stow(body, arm, (thing.object_id,))
@@ -149,7 +152,9 @@ def _judge(gap_m: float, outcome: str) -> None:
         raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
 
 
-def _apply(body: Body, action: Action, reach: Reach, luck: Luck, effect: Callable[[ObjectInstance], None]) -> Skill:
+def _apply(
+    body: Body, action: Action, reach: Reach, outcome_draw: OutcomeDraw, effect: Callable[[ObjectInstance], None]
+) -> Skill:
     """Brings the tool in the hand onto the object, presses until it touches, draws it to and fro, and has its effect.
 
     Raises:
@@ -168,7 +173,7 @@ def _apply(body: Body, action: Action, reach: Reach, luck: Luck, effect: Callabl
             break
         yield from nudge(body, arm, np.array([0.0, 0.0, -_PRESS_M]))
         gap = body.probe.gap_m(mine, theirs)
-    outcome = luck(action)
+    outcome = outcome_draw(action)
     if gap <= GRASP_GAP_M and outcome == "success":
         along = body.turn_to_world(np.array([1.0, 0.0, 0.0]))
         for _ in range(_STROKES):

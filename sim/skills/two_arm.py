@@ -21,12 +21,11 @@ from sim.skills.body import Body, BothGoal, wait
 from sim.skills.checks import check_lift
 from sim.skills.failures import SkillFailure
 from sim.skills.grasps import solid_box
-from sim.skills.manipulate import GRASP_GAP_M, Luck
+from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import diagnose, route
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill
-from sim.world.liquids import spill
 
 __all__ = ["BOTH_TOLERANCE_M", "against_sag", "assess_lift", "hands_m", "lift"]
 
@@ -58,7 +57,7 @@ class BothReach:
 
 def _sides(body: Body, thing: ObjectInstance) -> dict[Arm, tuple[Array, Array]]:
     """Per arm the point that its palm presses on and the outward normal there, world frame."""
-    pose = body.world.pose(thing.object_id)
+    pose = body.world.poses.pose(thing.object_id)
     rotation = pose[:3, :3]
     low, high = solid_box(thing)
     center = pose[:3, 3] + rotation @ (0.5 * (low + high))
@@ -67,7 +66,7 @@ def _sides(body: Body, thing: ObjectInstance) -> dict[Arm, tuple[Array, Array]]:
     axis = int(np.argmax([abs(float(rotation[:, 0] @ left)), abs(float(rotation[:, 1] @ left))]))
     lateral = rotation[:, axis] * np.sign(rotation[:, axis] @ left)
     points: dict[Arm, tuple[Array, Array]] = {}
-    grips = body.world.grips(thing.object_id, "double") if thing.type.grips.get("double") and axis == 0 else None
+    grips = body.world.poses.grips(thing.object_id, "double") if thing.type.grips.get("double") and axis == 0 else None
     for arm, sign in ((Arm.LEFT, 1.0), (Arm.RIGHT, -1.0)):
         normal = sign * lateral
         point = center + normal * half[axis]
@@ -133,7 +132,7 @@ def _way(body: Body, goal: BothGoal) -> BothGoal:
     return BothGoal(middle, 0.5 * (body.commanded_waist() + goal.waist), 0.0)
 
 
-def lift(body: Body, action: Action, luck: Luck) -> Skill:
+def lift(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Lift: takes an object between both hands and raises it.
 
     Raises:
@@ -151,16 +150,16 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
         yield from body.move_both([reach.before])
         yield from body.stow_both()
         raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": max(gaps.values())})
-    outcome = luck(action)
+    outcome = outcome_draw(action)
     for arm in Arm:
-        body.world.attach(arm.value, thing.object_id)
+        body.world.grasps.attach(arm.value, thing.object_id)
     first = _shifted(body, _FIRST_M, 0.0)
     yield from body.move_both([first], speed=0.5)
     if outcome != "success":
         for arm in Arm:
-            body.world.detach(arm.value)
+            body.world.grasps.detach(arm.value)
         if outcome == "spilled":
-            spill(body.world, thing)
+            body.world.liquids.spill(thing)
         yield from body.move_both([reach.before])
         yield from body.stow_both()
         code = FailureCode.SPILLED if outcome == "spilled" else FailureCode.SLIPPED
@@ -176,10 +175,10 @@ def lift(body: Body, action: Action, luck: Luck) -> Skill:
         if higher is not None:
             yield from body.move_both([higher], speed=0.5)
     yield from wait(0.1)
-    if body.lifted != thing.object_id or thing.object_id in body.world.all_parents():
+    if body.lifted != thing.object_id or thing.object_id in body.world.containment.all_parents():
         for arm in Arm:
             if thing.object_id == body.held[arm] or arm.value in thing.held_by:
-                body.world.detach(arm.value)
+                body.world.grasps.detach(arm.value)
         yield from body.move_both([reach.before])
         yield from body.stow_both()
         raise SkillFailure(FailureCode.DROPPED)

@@ -220,7 +220,7 @@ def settle(
             if not any(_in_reach(name, navigation, point) for point in choices):
                 where = choices[0].round(2) if choices else "its spots, which are taken,"
                 raise WorldError(f"{name} does not reach {object_id} at {where} in {draft.room}")
-    positions = {name: world.center(name)[:2] for name in world.objects}
+    positions = {name: world.poses.center(name)[:2] for name in world.objects}
     if source == "train":
         radius = max(load_robot(name).footprint_radius_m for name in robots)
         first = next(iter(draft.objects)) if "a" not in draft.focus else draft.focus["a"]
@@ -287,9 +287,9 @@ def _spots(empty: World, draft: Draft, rng: np.random.Generator) -> dict[str, ND
         thing = empty.object(carrier)
         was_open, thing.openness = thing.openness, 1.0
         other = draft.beside.get(name)
-        anchor = None if other is None else spots[other][:2] if other in spots else empty.pose(other)[:2, 3]
+        anchor = None if other is None else spots[other][:2] if other in spots else empty.poses.pose(other)[:2, 3]
         for _ in range(12):
-            spot = empty.free_spot(carrier, narrow, height_m=kind.size[2], rng=rng, band_m=band, gap_m=0.04)
+            spot = empty.containment.free_spot(carrier, narrow, height_m=kind.size[2], rng=rng, band_m=band, gap_m=0.04)
             if spot is None or any(
                 there == carrier and float(np.linalg.norm(spot[:2] - place)) <= radius + size + _HAND_GAP_M
                 for place, size, there in taken
@@ -313,12 +313,12 @@ def _hand_points(world: World, object_id: str, draft: Draft, rng: np.random.Gene
     thing = world.object(object_id)
     goal = next((goal for goal in draft.goals if goal.object_id == object_id), None)
     if thing.movable and not (thing.moving and goal is not None and goal.kind in ("open", "closed")):
-        return [world.center(object_id)]
+        return [world.poses.center(object_id)]
     if goal is not None and goal.kind.startswith("toggled"):
-        return [world.toggle_point(object_id)]
+        return [world.poses.toggle_point(object_id)]
     if thing.moving:
-        return [world.handle(object_id)]
-    spots = [world.free_spot(object_id, _SMALL_RADIUS_M, rng=rng, band_m=_EDGE_BAND_M) for _ in range(_SPOTS)]
+        return [world.poses.handle(object_id)]
+    spots = [world.containment.free_spot(object_id, _SMALL_RADIUS_M, rng=rng, band_m=_EDGE_BAND_M) for _ in range(_SPOTS)]
     return [spot + (0.0, 0.0, 0.05) for spot in spots if spot is not None]
 
 
@@ -348,7 +348,7 @@ def _in_reach(robot: str, navigation: NavigationMap, point: NDArray[np.float64])
 
 def _yaw_deg(rng: np.random.Generator, empty: World, name: str, carrier: str) -> float:
     """Small objects stand roughly square to the furniture; big ones square to it, within reach."""
-    rotation = empty.pose(carrier)[:2, :2]
+    rotation = empty.poses.pose(carrier)[:2, :2]
     along = float(np.rad2deg(np.arctan2(rotation[1, 0], rotation[0, 0])))
     kind = name.rsplit("_", 1)[0]
     if kind in BIG_TYPES:

@@ -105,7 +105,7 @@ def film(name: str, robot: str, folder: Path, size: int = 360) -> bool:
         nonlocal ticks
         ticks += 1
         if ticks % _STRIDE == 0:
-            stills.append(np.concatenate([world.render(camera, 240, 240).rgb for camera in ("left", "head")], axis=0))
+            stills.append(np.concatenate([world.cameras.render(camera, 240, 240).rgb for camera in ("left", "head")], axis=0))
 
     session.watchers.append(watch)
     with VideoRecorder(session, folder / f"{name}_{robot}.mp4", ("behind", "left", "head"), size) as video:

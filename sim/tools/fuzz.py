@@ -29,7 +29,6 @@ from sim.interfaces.aliases import ALIASES
 from sim.interfaces.controller import Controller, Event
 from sim.robots.spec import available_robots
 from sim.scene.rooms import room_names
-from sim.world.liquids import balance_l
 
 __all__ = ["FuzzConfig", "Tally", "calls", "check", "fuzz", "main"]
 
@@ -229,20 +228,21 @@ def check(controller: Controller, event: Event | None) -> list[str]:
             slack = _JOINT_SLACK if int(model.jnt_type[index]) == int(mujoco.mjtJoint.mjJNT_HINGE) else 0.2 * _JOINT_SLACK
             if not low - slack <= value <= high + slack:
                 wrong.append(f"joint {joint} is at {value:.3f}, outside [{low:.3f}, {high:.3f}]")
-    if abs(balance_l(world)) > 1e-6:
-        wrong.append(f"liquid is not conserved: {balance_l(world):+.6f} l")
+    if abs(world.liquids.balance_l()) > 1e-6:
+        wrong.append(f"liquid is not conserved: {world.liquids.balance_l():+.6f} l")
     wrong += _check_holders(controller)
     return wrong if event is None else wrong + _check_event(controller, event)
 
 
 def _check_holders(controller: Controller) -> list[str]:
     world = controller.session.world
-    assert world.constraints is not None
     wrong: list[str] = []
     for arm in ("left", "right"):
         held = [name for name, thing in world.objects.items() if arm in thing.held_by]
-        if len(held) > 1 or bool(held) != world.constraints.holds(arm):
-            wrong.append(f"the {arm} hand holds {held}, its constraint is {'on' if world.constraints.holds(arm) else 'off'}")
+        if len(held) > 1 or bool(held) != world.grasps.constraints.holds(arm):
+            wrong.append(
+                f"the {arm} hand holds {held}, its constraint is {'on' if world.grasps.constraints.holds(arm) else 'off'}"
+            )
     return wrong
 
 

@@ -40,14 +40,14 @@ def room_pictures(folder: Path, robot: str = "h1") -> list[Path]:
             ("left", 500, 500),
         ):
             path = folder / f"{room}_{camera}_{width}.png"
-            iio.imwrite(path, world.render(camera, height, width).rgb)
+            iio.imwrite(path, world.cameras.render(camera, height, width).rgb)
             written.append(path)
     return written
 
 
 def room_sheet(width: int = 400, columns: int = 4) -> NDArray[np.uint8]:
     """(rows * 0.75 * width, columns * width, 3) every room from above, with its objects, in the order of their names."""
-    tiles = [World(None, room).render("overview", width * 3 // 4, width).rgb for room in room_names()]
+    tiles = [World(None, room).cameras.render("overview", width * 3 // 4, width).rgb for room in room_names()]
     rows = -(-len(tiles) // columns)
     tiles += [np.full_like(tiles[0], 255)] * (rows * columns - len(tiles))
     return np.concatenate([np.concatenate(tiles[r * columns : (r + 1) * columns], axis=1) for r in range(rows)], axis=0)

@@ -112,7 +112,7 @@ class VideoRecorder:
     ) -> None:
         self._session, self._path = session, Path(path)
         self._cameras, self._fps = tuple(cameras), fps
-        self._renderer = Renderer(session.world, size, size, pretty=pretty)
+        self._renderer = Renderer(session.world.scene, size, size, pretty=pretty)
         self._world = session.world
         self._font = ImageFont.load_default(15)
         self._temporary = self._path.with_name(f".{self._path.stem}.{os.getpid()}.mp4")

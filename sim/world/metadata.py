@@ -6,16 +6,13 @@ AI2-THOR's, plus `heldBy` (arms that hold the object), `center`, `temperatureCel
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
-from sim.world import liquids
+from sim.scene.objects import ObjectInstance
 from sim.world.placement import box_in_world
-
-if TYPE_CHECKING:
-    from sim.scene.objects import ObjectInstance
-    from sim.world.world import World
+from sim.world.world import World
 
 __all__ = ["object_metadata", "temperature_name", "world_metadata"]
 
@@ -44,7 +41,7 @@ def object_metadata(world: World, thing: ObjectInstance, parents: tuple[str, ...
         "position": _xyz(position),
         "center": _xyz(center),
         "rotation": _euler(world, thing),
-        "distance": world.distance_to(thing.object_id),
+        "distance": world.servos.distance_to((low, high)),
         "receptacle": kind.receptacle,
         "toggleable": kind.toggleable,
         "isToggled": state.isToggled,
@@ -71,12 +68,12 @@ def object_metadata(world: World, thing: ObjectInstance, parents: tuple[str, ...
         "heldBy": list(thing.held_by),
         "moveable": thing.movable and not kind.pickupable,
         "isMoveable": thing.movable,
-        "isMoving": world.speed_of(thing.object_id) > 0.02,
+        "isMoving": world.poses.speed_m_s(thing.object_id) > 0.02,
         "isHeatSource": kind.has("heat_source"),
         "isColdSource": kind.has("cold_source"),
         "temperature": temperature_name(state.temperature),
         "temperatureCelsius": state.temperature,
-        "mass": world.total_mass_kg(thing.object_id) if thing.movable else 0.0,
+        "mass": world.containment.total_mass_kg(thing.object_id) if thing.movable else 0.0,
         "salientMaterials": list(kind.materials),
         "parentReceptacles": list(parents),
         "receptacleObjectIds": list(contents),
@@ -88,7 +85,7 @@ def object_metadata(world: World, thing: ObjectInstance, parents: tuple[str, ...
 
 def world_metadata(world: World) -> dict[str, Any]:
     """The whole scene's record: `objects`, `agent`, `sceneName`, `sceneBounds`, `inventoryObjects`."""
-    parents = world.all_parents()
+    parents = world.containment.all_parents()
     contents: dict[str, list[str]] = {}
     for name, above in parents.items():
         for parent in above:
@@ -107,11 +104,11 @@ def world_metadata(world: World) -> dict[str, Any]:
             for thing in world.objects.values()
             if thing.held_by
         ],
-        "spills": liquids.facts(world),
+        "spills": world.liquids.metadata(),
         "time": world.time_s,
     }
     if world.robot is not None:
-        pose = world.base_pose
+        pose = world.servos.base_pose
         record["agent"] = {
             "name": world.robot.name,
             "position": _xyz(pose[:3]),
@@ -119,8 +116,8 @@ def world_metadata(world: World) -> dict[str, Any]:
             "pelvisHeight": float(pose[2]),
             "isStanding": bool(pose[2] > world.robot.standing_pelvis_height_m - _STANDING_M),
             "cameraHorizon": _horizon(world),
-            "jointAngles": world.joint_positions(),
-            "handOpening": {"left": world.hand_opening("left"), "right": world.hand_opening("right")},
+            "jointAngles": world.servos.joint_positions(),
+            "handOpening": {"left": world.servos.hand_opening("left"), "right": world.servos.hand_opening("right")},
         }
     return record
 

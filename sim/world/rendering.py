@@ -10,7 +10,7 @@ Camera frame: x right, y down, z forward. Shape letters: H rows, W columns.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import mujoco
 import numpy as np
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from sim.gl import RenderingError
 from sim.world.canvas import shared_canvas
+from sim.world.poses import ObjectPoses
+from sim.world.scene_state import SceneState
+from sim.world.servos import Servos
 
-if TYPE_CHECKING:
-    from sim.world.world import World
-
-__all__ = ["CAMERAS", "Renderer", "RenderingError", "View", "camera_intrinsics", "camera_pose"]
+__all__ = ["CAMERAS", "Cameras", "Renderer", "RenderingError", "View", "camera_intrinsics", "camera_pose"]
 
 CAMERAS: Final = ("head", "front", "left", "right", "behind", "top", "overview", "plan")
 MAX_SIZE: Final = 1280
@@ -44,7 +44,7 @@ class View:
     Attributes:
         rgb: (H, W, 3) uint8.
         depth: (H, W) float32 metres along the optical axis, or None.
-        segmentation: (H, W) int32, index into `World.objects` in their order, -1 for walls, floor and sky, -2 for the
+        segmentation: (H, W) int32, index into the scene's objects in their order, -1 for walls, floor and sky, -2 for the
             robot; or None.
         intrinsics: (3, 3) K in pixels.
         camera_in_world: (4, 4) pose of the camera (x right, y down, z forward).
@@ -57,28 +57,28 @@ class View:
     camera_in_world: NDArray[np.float64]
 
 
-def camera_intrinsics(world: World, camera: str, height: int, width: int) -> NDArray[np.float64]:
+def camera_intrinsics(scene: SceneState, camera: str, height: int, width: int) -> NDArray[np.float64]:
     """(3, 3) pinhole matrix in pixels; the field of view is vertical, pixels are square."""
-    fovy = float(np.radians(world.model.cam_fovy[_camera_id(world, camera)]))
+    fovy = float(np.radians(scene.model.cam_fovy[_camera_id(scene, camera)]))
     focal = 0.5 * height / np.tan(fovy / 2.0)
     return np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
 
 
-def camera_pose(world: World, camera: str) -> NDArray[np.float64]:
+def camera_pose(scene: SceneState, camera: str) -> NDArray[np.float64]:
     """(4, 4) pose of a camera in the world, x right, y down, z forward; one around the robot comes closer before furniture."""
-    index, pose = _camera_id(world, camera), np.eye(4)
-    pose[:3, :3] = world.data.cam_xmat[index].reshape(3, 3) * np.array([1.0, -1.0, -1.0])
-    pose[:3, 3] = _unobstructed(world, index) if camera in _FOLLOWING else world.data.cam_xpos[index]
+    index, pose = _camera_id(scene, camera), np.eye(4)
+    pose[:3, :3] = scene.data.cam_xmat[index].reshape(3, 3) * np.array([1.0, -1.0, -1.0])
+    pose[:3, 3] = _unobstructed(scene, index) if camera in _FOLLOWING else scene.data.cam_xpos[index]
     return pose
 
 
-def _unobstructed(world: World, camera: int) -> NDArray[np.float64]:
+def _unobstructed(scene: SceneState, camera: int) -> NDArray[np.float64]:
     """(3,) place of a camera around the robot, drawn in along its sight to before the furniture.
 
     Walls are looked through from outside. Furniture that is close to the robot is not avoided: the picture would show little
     of the robot but its back.
     """
-    model, data = world.model, world.data
+    model, data = scene.model, scene.data
     target, place = data.xpos[int(model.cam_bodyid[camera])], data.cam_xpos[camera]
     away = place - target
     length = float(np.linalg.norm(away))
@@ -95,11 +95,11 @@ def _unobstructed(world: World, camera: int) -> NDArray[np.float64]:
     return place.copy()
 
 
-def _camera_id(world: World, camera: str) -> int:
-    name = world.robot.head_camera if camera == "head" and world.robot is not None else camera
-    index = mujoco.mj_name2id(world.model, int(mujoco.mjtObj.mjOBJ_CAMERA), name)
+def _camera_id(scene: SceneState, camera: str) -> int:
+    name = scene.robot.head_camera if camera == "head" and scene.robot is not None else camera
+    index = mujoco.mj_name2id(scene.model, int(mujoco.mjtObj.mjOBJ_CAMERA), name)
     if index < 0:
-        names = ", ".join(str(world.model.camera(i).name) for i in range(world.model.ncam))
+        names = ", ".join(str(scene.model.camera(i).name) for i in range(scene.model.ncam))
         raise ValueError(f"unknown camera {camera!r}; allowed: {names}")
     return index
 
@@ -108,7 +108,7 @@ class Renderer:
     """Draws a world at one size.
 
     Args:
-        world: what is drawn; it may advance between calls.
+        scene: what is drawn; it may advance between calls.
         height: rows, at most 1280.
         width: columns, at most 1280.
         pretty: shadows and reflections, for demonstration videos.
@@ -118,12 +118,12 @@ class Renderer:
         RenderingError: when no OpenGL context can be made.
     """
 
-    def __init__(self, world: World, height: int = 112, width: int = 112, *, pretty: bool = False) -> None:
+    def __init__(self, scene: SceneState, height: int = 112, width: int = 112, *, pretty: bool = False) -> None:
         if not (1 <= height <= MAX_SIZE and 1 <= width <= MAX_SIZE):
             raise ValueError(f"image size {height} x {width} outside 1..{MAX_SIZE}")
-        self._world, self._height, self._width, self._pretty = world, height, width, pretty
-        self._canvas = shared_canvas(world.model, world.model_name, height, width)
-        self._scene = mujoco.MjvScene(world.model, maxgeom=_MAX_GEOMS)
+        self._scene, self._height, self._width, self._pretty = scene, height, width, pretty
+        self._canvas = shared_canvas(scene.model, scene.name, height, width)
+        self._drawn = mujoco.MjvScene(scene.model, maxgeom=_MAX_GEOMS)
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = 0
         self._option.geomgroup[[0, 1, 2]] = 1
@@ -131,15 +131,15 @@ class Renderer:
         self._camera = mujoco.MjvCamera()
         self._camera.type = int(mujoco.mjtCamera.mjCAMERA_FIXED)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
-            self._scene.flags[int(flag)] = int(pretty)
-        self._planes = np.flatnonzero(world.model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))
-        robot = np.isin(world.model.geom_bodyid, list(world.robot_body_ids))
-        labels = np.where(robot, _ROBOT, world.object_of_geom).astype(np.int32)
+            self._drawn.flags[int(flag)] = int(pretty)
+        self._planes = np.flatnonzero(scene.model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))
+        robot = np.isin(scene.model.geom_bodyid, list(scene.robot_bodies))
+        labels = np.where(robot, _ROBOT, scene.object_of_geom).astype(np.int32)
         self._labels = np.append(labels, _NOTHING)  # the last entry is what geom -1, the sky, maps to
 
     def _out_of_view(self, camera: int) -> NDArray[np.bool_]:
         """(ngeom,) geoms whose bounding spheres lie behind a camera or beside its view; planes are never left out."""
-        model, data = self._world.model, self._world.data
+        model, data = self._scene.model, self._scene.data
         axes = data.cam_xmat[camera].reshape(3, 3)
         offsets = (data.geom_xpos - data.cam_xpos[camera]) @ axes  # right, up, back
         radius = model.geom_rbound
@@ -152,28 +152,28 @@ class Renderer:
 
     def _seen_from_behind(self, place: NDArray[np.float64]) -> NDArray[np.int64]:
         """Walls, floor or ceiling that a camera outside the room looks through; where there are none the sky is not seen."""
-        data, planes = self._world.data, self._planes
+        data, planes = self._scene.data, self._planes
         normals = data.geom_xmat[planes].reshape(-1, 3, 3)[:, :, 2]
         return planes[np.einsum("pi,pi->p", place - data.geom_xpos[planes], normals) < 0.0]
 
     def _look(self, camera: str) -> NDArray[np.float64]:
         """Brings the scene up to date for a camera; its (4, 4) pose."""
-        world = self._world
-        index = self._camera.fixedcamid = _camera_id(world, camera)
-        mujoco.mj_camlight(world.model, world.data)
-        place, pose = world.data.cam_xpos[index].copy(), camera_pose(world, camera)
-        world.data.cam_xpos[index] = pose[:3, 3]
+        scene = self._scene
+        index = self._camera.fixedcamid = _camera_id(scene, camera)
+        mujoco.mj_camlight(scene.model, scene.data)
+        place, pose = scene.data.cam_xpos[index].copy(), camera_pose(scene, camera)
+        scene.data.cam_xpos[index] = pose[:3, 3]
         everything = int(mujoco.mjtCatBit.mjCAT_ALL)
-        groups = world.model.geom_group
+        groups = scene.model.geom_group
         kept = groups.copy()
         if not self._pretty:  # shadows come from what is not in view, too
             groups[self._out_of_view(index)] = _UNSEEN_GROUP
         outside = self._seen_from_behind(pose[:3, 3])
         groups[outside] = _UNSEEN_GROUP
-        self._scene.flags[int(mujoco.mjtRndFlag.mjRND_SKYBOX)] = int(len(outside) > 0)
-        mujoco.mjv_updateScene(world.model, world.data, self._option, None, self._camera, everything, self._scene)
+        self._drawn.flags[int(mujoco.mjtRndFlag.mjRND_SKYBOX)] = int(len(outside) > 0)
+        mujoco.mjv_updateScene(scene.model, scene.data, self._option, None, self._camera, everything, self._drawn)
         groups[:] = kept
-        world.data.cam_xpos[index] = place
+        scene.data.cam_xpos[index] = place
         return pose
 
     def labels(self, camera: str = "head") -> NDArray[np.int32]:
@@ -183,7 +183,7 @@ class Renderer:
             ValueError: on an unknown camera.
         """
         self._look(camera)
-        return self._labels[self._canvas.depth_and_geoms(self._world.model, self._scene)[1]]
+        return self._labels[self._canvas.depth_and_geoms(self._scene.model, self._drawn)[1]]
 
     def view(self, camera: str = "head", *, depth: bool = False, segmentation: bool = False) -> View:
         """Draws one camera as the world is now.
@@ -191,16 +191,67 @@ class Renderer:
         Raises:
             ValueError: on an unknown camera.
         """
-        world, pose = self._world, self._look(camera)
+        scene, pose = self._scene, self._look(camera)
         distances = labels = None
         if depth or segmentation:
-            metres, geoms = self._canvas.depth_and_geoms(world.model, self._scene)
+            metres, geoms = self._canvas.depth_and_geoms(scene.model, self._drawn)
             distances = metres if depth else None
             labels = self._labels[geoms] if segmentation else None
         return View(
-            self._canvas.colors(self._scene),
+            self._canvas.colors(self._drawn),
             distances,
             labels,
-            camera_intrinsics(world, camera, self._height, self._width),
+            camera_intrinsics(scene, camera, self._height, self._width),
             pose,
         )
+
+
+class Cameras:
+    """The cameras of a running scene; OpenGL contexts are shared by equal scenes.
+
+    Args:
+        scene: the running scene.
+        poses, servos: how far objects are from the robot.
+    """
+
+    def __init__(self, scene: SceneState, poses: ObjectPoses, servos: Servos) -> None:
+        self._scene, self._poses, self._servos = scene, poses, servos
+        self._renderers: dict[tuple[int, int], Renderer] = {}
+
+    def render(
+        self, camera: str = "head", height: int = 112, width: int = 112, *, depth: bool = False, segmentation: bool = False
+    ) -> View:
+        """Draws a camera of `CAMERAS`."""
+        return self._renderer(height, width).view(camera, depth=depth, segmentation=segmentation)
+
+    def labels(self, camera: str = "head", height: int = 112, width: int = 112) -> NDArray[np.int32]:
+        """(H, W) segmentation of a camera as in `View`, for less than half of what a picture with it costs."""
+        return self._renderer(height, width).labels(camera)
+
+    def visible_objects(
+        self, segmentation: NDArray[np.int32] | None = None, *, min_pixels: int = 6, range_m: float = 8.0
+    ) -> dict[str, int]:
+        """Objects in the head camera's view and the number of pixels each covers.
+
+        Args:
+            segmentation: (H, W) labels of a `View`; None draws 112 x 112.
+            min_pixels: fewest pixels that count, for an image of 112 x 112; scaled with the image's area.
+            range_m: farthest horizontal distance from the base.
+        """
+        if segmentation is None:
+            segmentation = self.labels()
+        least = max(1.0, min_pixels * segmentation.size / 112**2)
+        names = list(self._scene.objects)
+        labels, counts = np.unique(segmentation[segmentation >= 0], return_counts=True)
+        found = {names[int(label)]: int(count) for label, count in zip(labels, counts, strict=True) if count >= least}
+        return {name: n for name, n in found.items() if self._servos.distance_to(self._poses.bounds(name)) <= range_m}
+
+    def close(self) -> None:
+        """Drops the renderers; the shared OpenGL contexts stay with the process, and drawing goes on when asked again."""
+        self._renderers.clear()
+
+    def _renderer(self, height: int, width: int) -> Renderer:
+        renderer = self._renderers.get((height, width))
+        if renderer is None:
+            renderer = self._renderers[height, width] = Renderer(self._scene, height, width)
+        return renderer

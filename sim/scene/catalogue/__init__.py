@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
+import numpy as np
 import yaml
 
 from configs.assets import own_files
@@ -190,7 +191,7 @@ class ObjectType:
         moving: doors, drawers and lids.
         surfaces: where objects can rest.
         grips: `single` and `double` to preferred hand points in the type's frame, metres.
-        capacity_l: litres of liquid that it holds; None for what the size suggests (`sim.world.liquids`).
+        capacity_l: litres of liquid that it holds; None for what the size suggests, see `volume_l`.
         materials: AI2-THOR's salient materials, subset of `MATERIALS`.
         note: remark from the measurements.
     """
@@ -274,6 +275,13 @@ class ObjectType:
     def movable(self) -> bool:
         """Whether it can be lifted, with one hand or two."""
         return "pickupable" in self.properties or "two_handed" in self.properties
+
+    @property
+    def volume_l(self) -> float:
+        """Litres that it holds: the given figure, else a sixth of its box, at most 2.4; 0 for what holds none."""
+        if not self.fillable:
+            return 0.0
+        return self.capacity_l if self.capacity_l is not None else float(min(150.0 * np.prod(self.size), 2.4))
 
     @property
     def fillable(self) -> bool:

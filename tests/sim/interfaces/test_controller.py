@@ -63,7 +63,7 @@ def test_save_load_and_teleport(controller):
     controller.step(action="SaveState", name="here")
     x, y = controller.session.body.navigation().free_positions()[0]
     assert controller.step(action="TP", x=float(x), y=float(y), rotation=90).metadata["actionReturn"] is True
-    assert np.allclose(controller.session.world.base_pose[:2], (x, y))
+    assert np.allclose(controller.session.world.servos.base_pose[:2], (x, y))
     assert not controller.step(action="TP", x=99.0, y=0.0).metadata["lastActionSuccess"]
     assert not controller.step(action="TP", x=1e308, y=0.0).metadata["lastActionSuccess"]
     for rotation in (1e308, -1e308, 36090.0):
@@ -71,7 +71,7 @@ def test_save_load_and_teleport(controller):
         assert abs(controller.session.body.base().yaw_rad) <= np.pi + 1e-6
     controller.step(action="TP", x=float(x), y=float(y), rotation=90)
     controller.step(action="LoadState", name="here")
-    assert not np.allclose(controller.session.world.base_pose[:2], (x, y))
+    assert not np.allclose(controller.session.world.servos.base_pose[:2], (x, y))
     assert len(controller.step(action="GetReachablePositions").metadata["actionReturn"]) > 10
     with pytest.raises(ValueError, match="no saved state 'there'; saved: here"):
         controller.step(action="LoadState", name="there")
@@ -84,9 +84,9 @@ def test_a_hand_at_a_door_keeps_the_robot_from_being_teleported(controller):
         controller.step(action="RotateLeft", amount=90)  # to see the cabinet
     for call in ({"action": "GoTo", "objectId": "Cabinet_1"}, {"action": "Hold", "arm": "left", "objectId": "Cabinet_1"}):
         assert controller.step(call).metadata["lastActionSuccess"]
-    before = controller.session.world.base_pose.copy()
+    before = controller.session.world.servos.base_pose.copy()
     assert not controller.step(action="TP", x=float(x), y=float(y)).metadata["lastActionSuccess"]
-    assert np.array_equal(controller.session.world.base_pose, before)
+    assert np.array_equal(controller.session.world.servos.base_pose, before)
     controller.step(action="Release", arm="left")
     assert controller.step(action="TP", x=float(x), y=float(y)).metadata["lastActionSuccess"]
 

@@ -38,18 +38,18 @@ def test_from_an_interactable_pose_the_arm_reaches(controller: Controller) -> No
 def test_objects_are_put_where_asked(controller: Controller) -> None:
     controller.reset()
     world = controller.session.world
-    before = world.pose("Mug_1")[:3, 3].copy()
-    spot = world.free_spot("DiningTable_1", 0.08, height_m=0.1)
+    before = world.poses.pose("Mug_1")[:3, 3].copy()
+    spot = world.containment.free_spot("DiningTable_1", 0.08, height_m=0.1)
     assert spot is not None
     target = {"x": float(spot[0]), "y": float(spot[1]), "z": float(spot[2]) + 0.002}
     pose = {"objectName": "Mug_1", "position": target, "rotation": {"x": 0, "y": 0, "z": 90}}
     event = controller.step("SetObjectPoses", objectPoses=[pose])
     assert event.metadata["lastActionSuccess"]
-    assert world.pose("Mug_1")[:2, 3] == pytest.approx(spot[:2], abs=0.01)
-    assert world.pose("Mug_1")[:3, 0] == pytest.approx([0.0, 1.0, 0.0], abs=0.02)
-    assert world.parents("Mug_1")[0] == "DiningTable_1"
+    assert world.poses.pose("Mug_1")[:2, 3] == pytest.approx(spot[:2], abs=0.01)
+    assert world.poses.pose("Mug_1")[:3, 0] == pytest.approx([0.0, 1.0, 0.0], abs=0.02)
+    assert world.containment.parents("Mug_1")[0] == "DiningTable_1"
     controller.step("Undo")
-    assert np.array_equal(world.pose("Mug_1")[:3, 3], before)
+    assert np.array_equal(world.poses.pose("Mug_1")[:3, 3], before)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_random_spawn_is_seeded_and_everything_rests(controller: Controller) -> 
     world = controller.session.world
     assert {entry["objectId"] for entry in first} == {item.id for item in world.room.objects}
     for entry in first:
-        assert world.parents(entry["objectId"])[0] == entry["receptacle"]
+        assert world.containment.parents(entry["objectId"])[0] == entry["receptacle"]
     poses = world.data.qpos.copy()
     again = controller.step("InitialRandomSpawn", randomSeed=3).metadata["actionReturn"]
     assert again == first and np.array_equal(controller.session.world.data.qpos, poses)
@@ -101,18 +101,18 @@ def test_teleport_takes_along_what_is_held() -> None:
     from sim.robots.spec import load_robot
 
     world = World(load_robot("h1"), "kitchen_1")
-    hand = world.grasp_pose("left")
+    hand = world.servos.grasp_pose("left")
     mug = world.objects["Mug_1"]
     world.data.qpos[mug.qpos_adr : mug.qpos_adr + 3] = hand[:3, 3] - (0, 0, 0.05)
-    world.put_base(*world.base_pose[[0, 1, 3]])
-    world.attach("left", "Mug_1")
+    world.grasps.put_base(*world.servos.base_pose[[0, 1, 3]])
+    world.grasps.attach("left", "Mug_1")
     world.advance(0.1)
-    offset = np.linalg.inv(world.grasp_pose("left")) @ world.pose("Mug_1")
-    world.put_base(0.6, -0.4, 1.0, 0.8)
-    assert np.linalg.inv(world.grasp_pose("left")) @ world.pose("Mug_1") == pytest.approx(offset, abs=1e-9)
+    offset = np.linalg.inv(world.servos.grasp_pose("left")) @ world.poses.pose("Mug_1")
+    world.grasps.put_base(0.6, -0.4, 1.0, 0.8)
+    assert np.linalg.inv(world.servos.grasp_pose("left")) @ world.poses.pose("Mug_1") == pytest.approx(offset, abs=1e-9)
     world.advance(0.2)
-    assert world.base_pose == pytest.approx([0.6, -0.4, 0.8, 1.0], abs=5e-3)
-    assert np.linalg.norm((np.linalg.inv(world.grasp_pose("left")) @ world.pose("Mug_1") - offset)[:3, 3]) < 0.01
+    assert world.servos.base_pose == pytest.approx([0.6, -0.4, 0.8, 1.0], abs=5e-3)
+    assert np.linalg.norm((np.linalg.inv(world.servos.grasp_pose("left")) @ world.poses.pose("Mug_1") - offset)[:3, 3]) < 0.01
 
 
 @pytest.mark.parametrize(

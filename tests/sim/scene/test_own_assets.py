@@ -75,7 +75,7 @@ def test_ones_own_robot_picks_ones_own_type_in_ones_own_room(folder: Path) -> No
             assert "Teapot_1" in session.observation().visible_objects
         _, feedback = session.step(PlanStep.parse(text))
         assert feedback.success, feedback.to_text()
-    assert session.world.held("left") == "Teapot_1"
+    assert session.world.grasps.held("left") == "Teapot_1"
 
 
 def test_ones_own_luck(folder: Path) -> None:
@@ -84,7 +84,7 @@ def test_ones_own_luck(folder: Path) -> None:
     for text in ("GoTo(Shelf_1)", "GoTo(Teapot_1)"):
         session.step(PlanStep.parse(text))
     _, feedback = session.step(PlanStep.parse("Pick(left, Teapot_1)"))
-    assert feedback.outcomes[0].code == "Slipped" and session.world.held("left") is None
+    assert feedback.outcomes[0].code == "Slipped" and session.world.grasps.held("left") is None
 
 
 def test_they_are_listed_beside_the_projects(folder: Path) -> None:

@@ -26,7 +26,7 @@ def test_rooms_use_every_type() -> None:
 def test_furniture_stands_inside_and_apart(room: str) -> None:
     world = World(None, room, [], settle_s=0.1)
     x0, y0, x1, y1 = world.room.bounds
-    boxes = {name: world.bounds(name) for name in world.objects}
+    boxes = {name: world.poses.bounds(name) for name in world.objects}
     for name, (low, high) in boxes.items():
         assert low[0] >= x0 - 0.02 and low[1] >= y0 - 0.02 and high[0] <= x1 + 0.02 and high[1] <= y1 + 0.02, name
         assert low[2] >= -0.001, name
@@ -43,17 +43,17 @@ def test_every_receptacle_can_be_approached(room: str) -> None:
     world = World(None, room, [], settle_s=0.1)
     rectangles = []
     for name in world.objects:
-        low, high = world.bounds(name)
+        low, high = world.poses.bounds(name)
         if low[2] < 1.9:
             rectangles.append(Rectangle(tuple((low[:2] + high[:2]) / 2), tuple((high[:2] - low[:2]) / 2)))
     free = NavigationMap(world.room.bounds, rectangles, 0.35)
     start = np.asarray(world.room.start[:2])
     assert free.is_free(start)
     for name in world.objects:
-        low, high = world.bounds(name)
+        low, high = world.poses.bounds(name)
         surfaces = world.objects[name].surfaces
-        sides = [world.front(name)] + ([-world.front(name)] if any(s.spec.all_sides for s in surfaces) else [])
-        stances = [world.center(name)[:2] + side * (0.5 * float((high - low)[:2] @ np.abs(side)) + 0.4) for side in sides]
+        sides = [world.poses.front(name)] + ([-world.poses.front(name)] if any(s.spec.all_sides for s in surfaces) else [])
+        stances = [world.poses.center(name)[:2] + side * (0.5 * float((high - low)[:2] @ np.abs(side)) + 0.4) for side in sides]
         near = [stance + np.array([dx, dy]) for stance in stances for dx in (-0.2, 0.0, 0.2) for dy in (-0.2, 0.0, 0.2)]
         if name.startswith(("Chair", "Faucet", "SinkBasin", "Stove", "Microwave", "Television", "Toaster", "CoffeeMachine")):
             continue  # on or at other furniture
@@ -79,9 +79,9 @@ def test_door_swings_out_of_the_body() -> None:
         None, "kitchen_1", [], states={name: {"isOpen": True} for name in ("Fridge_1", "Cabinet_1", "Microwave_1", "Drawer_1")}
     )
     for name in ("Fridge_1", "Cabinet_1", "Microwave_1", "Drawer_1"):
-        offset = (world.handle(name) - world.center(name))[:2] @ world.front(name)
-        low, high = world.bounds(name)
-        assert offset > 0.15 + 0.5 * float(np.abs((high - low)[:2]) @ np.abs(world.front(name))), name
+        offset = (world.poses.handle(name) - world.poses.center(name))[:2] @ world.poses.front(name)
+        low, high = world.poses.bounds(name)
+        assert offset > 0.15 + 0.5 * float(np.abs((high - low)[:2]) @ np.abs(world.poses.front(name))), name
 
 
 def test_fixtures_cannot_be_placed() -> None:

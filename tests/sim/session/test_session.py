@@ -58,7 +58,7 @@ def test_observation_holds_what_a_planner_may_see(session):
     pose = seen.camera.camera_in_pelvis
     assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
     assert 0.3 < pose[2, 3] < 1.0 and pose[2, 2] < 0.0  # above the pelvis, looking down
-    assert session.world.base_pose[2] == pytest.approx(0.95, abs=0.01)
+    assert session.world.servos.base_pose[2] == pytest.approx(0.95, abs=0.01)
 
 
 def test_fetching_the_mug(session):

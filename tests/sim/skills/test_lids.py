@@ -14,6 +14,7 @@ from sim.scene.catalogue import load_catalogue
 from sim.scene.compiler import build_type_spec
 from sim.scene.objects import ObjectPlacement, index_object
 from sim.session.session import FreePlay, Session
+from sim.world.metadata import world_metadata
 from sim.world.world import World
 
 LIDDED = ("Box", "Book", "Kettle", "Laptop", "Toilet", "LaundryHamper")
@@ -30,7 +31,7 @@ def alone(name, openness):
 
 
 def entry(world, name):
-    return next(found for found in world.metadata()["objects"] if found["objectId"] == name)
+    return next(found for found in world_metadata(world)["objects"] if found["objectId"] == name)
 
 
 def act(session, text):
@@ -135,7 +136,7 @@ def test_lids_stay_where_they_are_in_a_room_with_a_robot_that_moves(world):
     names = ("Box_1", "Box_2", "Laptop_1", "Book_1", "LaundryHamper_1")
     snapshot, before = world.save(), [world.object(name).openness for name in names]
     for k in range(50):
-        world.set_hand("left", 0.5 + 0.5 * float(np.sin(k)))
+        world.servos.set_hand("left", 0.5 + 0.5 * float(np.sin(k)))
         world.advance(0.1)
     assert [world.object(name).openness for name in names] == pytest.approx(before, abs=0.03)
     world.restore(snapshot)
@@ -195,7 +196,7 @@ def test_a_lifted_box_and_laptop_keep_their_lids_shut(session):
 def test_an_open_book_is_picked_up_by_its_pages(session):
     start(session, "bedroom_1", ObjectPlacement("Book_1", "Desk_1", (-0.22, -2.3), yaw_deg=180.0, state={"isOpen": True}))
     assert reach(session, "Pick(right, Book_1)").success
-    assert session.world.parents("Book_1") == () and session.world.object("Book_1").is_open
+    assert session.world.containment.parents("Book_1") == () and session.world.object("Book_1").is_open
 
 
 def test_a_toilet_lid_shuts_nothing_away(session):
@@ -217,7 +218,7 @@ CASES = (
 @pytest.mark.parametrize(("room", "placements", "arm", "name"), CASES, ids=[case[-1] for case in CASES])
 def test_a_lid_opens_and_closes_by_hand(session, room, placements, arm, name):
     world = start(session, room, *placements)
-    before = world.pose(name)[:3, 3]
+    before = world.poses.pose(name)[:3, 3]
     verbs = ("Close", "Open") if world.object(name).is_open else ("Open", "Close")
     for verb in verbs:
         outcome = reach(session, f"{verb}({arm}, {name})")
@@ -225,5 +226,5 @@ def test_a_lid_opens_and_closes_by_hand(session, room, placements, arm, name):
         assert entry(world, name)["isOpen"] == (verb == "Open")
         if verb == "Close":
             assert world.object(name).openness < 0.12
-    assert np.linalg.norm(world.pose(name)[:3, 3] - before) < 0.08
-    assert world.pose(name)[2, 2] > 0.99
+    assert np.linalg.norm(world.poses.pose(name)[:3, 3] - before) < 0.08
+    assert world.poses.pose(name)[2, 2] > 0.99

@@ -7,6 +7,7 @@ import pytest
 from data.interface.steps import Action, PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
+from sim.world.metadata import world_metadata
 from sim.world.world import World, WorldError
 
 DOORS = ("Fridge_1", "Cabinet_1", "Drawer_1", "Microwave_1")
@@ -19,7 +20,7 @@ def test_springs_shut_doors_and_drawers_within_two_seconds() -> None:
     assert all(0.3 < world.objects[name].openness < 0.9 for name in DOORS[:3]), "slowed by a damper"
     world.advance(2.0)
     assert [round(world.objects[name].openness, 2) for name in DOORS] == [0.0, 0.0, 0.0, 1.0]
-    assert {entry["objectId"] for entry in world.metadata()["objects"] if entry["selfClosing"]} == set(DOORS[:3])
+    assert {entry["objectId"] for entry in world_metadata(world)["objects"] if entry["selfClosing"]} == set(DOORS[:3])
 
 
 def test_what_has_no_door_cannot_fall_shut() -> None:
@@ -39,7 +40,7 @@ def test_one_hand_holds_a_drawer_open_while_the_other_takes_something_out(robot:
     mine, other = {"h1": ("right", "left"), "x1": ("left", "right")}[robot]
     for text in (*place, f"Open({mine}, Drawer_1)"):
         assert session.act(PlanStep.parse(text)).success, text
-    assert world.held(mine) == "Drawer_1" and world.objects["Drawer_1"].openness > 0.6
+    assert world.grasps.held(mine) == "Drawer_1" and world.objects["Drawer_1"].openness > 0.6
     assert session.act(PlanStep.parse("MoveBack(0.2)")).outcomes[0].code == "InUse"
     assert session.act(PlanStep.parse(f"Pick({mine}, PepperShaker_1)")).outcomes[0].code == "HandOccupied"
     saved = session.snapshot()
@@ -49,7 +50,7 @@ def test_one_hand_holds_a_drawer_open_while_the_other_takes_something_out(robot:
     session.restore(saved)
     for text in (f"Pick({other}, PepperShaker_1)", f"Release({mine})"):
         assert session.act(PlanStep.parse(text)).success, text
-    assert world.held(other) == "PepperShaker_1" and world.objects["Drawer_1"].openness < 0.03
+    assert world.grasps.held(other) == "PepperShaker_1" and world.objects["Drawer_1"].openness < 0.03
 
 
 def test_imagined_steps_leave_no_trace() -> None:

@@ -16,6 +16,7 @@ from sim.skills.plan_cache import cached_plan
 from sim.skills.push import Push
 from sim.skills.runner import refuse, run_skills
 from sim.skills.set_down import assess_place_both
+from sim.world.metadata import world_metadata
 from sim.world.world import World
 
 THINGS = (
@@ -62,11 +63,11 @@ def reach(session, text):
 def test_pick_carry_and_place(session):
     start(session)
     assert reach(session, "Pick(right, Mug_1)").success
-    assert session.body.held[Arm.RIGHT] == "Mug_1" and session.world.parents("Mug_1") == ()
+    assert session.body.held[Arm.RIGHT] == "Mug_1" and session.world.containment.parents("Mug_1") == ()
     assert act(session, "Pick(right, Apple_1)")[0].code == "HandOccupied"
     assert act(session, "Pick(left, Mug_1)")[0].code == "AlreadyHeld"
     assert reach(session, "Place(right, CounterTop_1)").success
-    assert session.body.held[Arm.RIGHT] is None and "CounterTop_1" in session.world.parents("Mug_1")
+    assert session.body.held[Arm.RIGHT] is None and "CounterTop_1" in session.world.containment.parents("Mug_1")
 
 
 def test_a_drawer_opens_and_closes(session):
@@ -222,9 +223,9 @@ def test_moves_stop_at_obstacles(session):
 
 def test_rotation_and_sidestep(session):
     start(session)
-    before = session.world.base_pose.copy()
+    before = session.world.servos.base_pose.copy()
     assert act(session, "RotateLeft(90)")[0].success and act(session, "MoveRight(0.2)")[0].success
-    after = session.world.base_pose
+    after = session.world.servos.base_pose
     assert after[3] - before[3] == pytest.approx(np.pi / 2, abs=0.02)
     shift = after[:2] - before[:2]
     right = np.array([np.sin(after[3]), -np.cos(after[3])])
@@ -236,7 +237,7 @@ def test_pelvis_height_follows_the_legs_limits(session):
     low, high = session.robot.pelvis_height_range_m
     outcome = act(session, "MoveDown(0.9)")[0]
     assert outcome.code == "HeightLimit" and outcome.category is FailureCategory.BODY_ADJUSTMENT
-    assert session.world.base_pose[2] == pytest.approx(low, abs=0.01)
+    assert session.world.servos.base_pose[2] == pytest.approx(low, abs=0.01)
     assert outcome.margins["height_m"] == pytest.approx(high - 0.9 - low, abs=0.01)
     soles = [session.world.data.site(f"{side}_sole").xpos[2] for side in ("left", "right")]
     assert np.abs(soles).max() < 0.02
@@ -261,10 +262,10 @@ def test_two_hands_lift_a_box():
     start(made, FreePlay("living_room_1", placements=(ObjectPlacement("Box_1", "CoffeeTable_1"),)))
     assert act(made, "Pick(left, Box_1)")[0].code == "NeedsTwoHands"
     assert reach(made, "Lift(Box_1)").success
-    assert made.body.lifted == "Box_1" and made.world.metadata()["inventoryObjects"][0]["arms"] == ["left", "right"]
+    assert made.body.lifted == "Box_1" and world_metadata(made.world)["inventoryObjects"][0]["arms"] == ["left", "right"]
     assert act(made, "ResetArm(left)")[0].code == "BothHandsBusy"
     assert reach(made, "PlaceBoth(Desk_1)").success
-    assert "Desk_1" in made.world.parents("Box_1")
+    assert "Desk_1" in made.world.containment.parents("Box_1")
     made.close()
 
 
@@ -277,7 +278,7 @@ def test_a_load_that_is_carried_low_comes_up_before_the_desk(robot):
     assert reach(made, "Lift(HousePlant_1)").success
     top = 0.8
     act(made, "GoTo(Desk_1)")
-    assert made.world.bounds("HousePlant_1")[0][2] < top
+    assert made.world.poses.bounds("HousePlant_1")[0][2] < top
     action, verdicts = Action.parse("PlaceBoth(Desk_1)"), []
     for _ in range(4):
         verdicts.append(made.assess(action))
@@ -289,7 +290,7 @@ def test_a_load_that_is_carried_low_comes_up_before_the_desk(robot):
     plan = assess_place_both(made.body, action)
     assert plan.raised is not None and plan.surface_m == pytest.approx(top, abs=0.01)
     assert act(made, "PlaceBoth(Desk_1)")[0].success
-    assert "Desk_1" in made.world.parents("HousePlant_1")
+    assert "Desk_1" in made.world.containment.parents("HousePlant_1")
     made.close()
 
 
@@ -337,7 +338,7 @@ def test_a_plan_is_made_once_until_something_changes(session):
     first = plan(body, action)
     assert plan(body, action) is first and len(made) == 1
     assert plan(body, Action("ResetArm", arm=Arm.RIGHT)) is not first
-    session.world.set_state("Mug_1", "isDirty", True)
+    session.world.states.set_state("Mug_1", "isDirty", True)
     second = plan(body, action)
     assert second is not first
     body.command_hand(Arm.LEFT, 0.5)

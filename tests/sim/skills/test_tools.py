@@ -11,7 +11,6 @@ from data.interface.feedback import Feedback
 from data.interface.steps import PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
-from sim.world.liquids import balance_l, capacity_l
 
 
 def _started(
@@ -54,13 +53,17 @@ def test_a_knife_slices(robot: str) -> None:
     session = _started(robot, [ObjectPlacement("Knife_1", TABLE, (1.5, -0.78)), ObjectPlacement("Apple_1", TABLE, (1.8, -0.8))])
     world = session.world
     assert _code(session, "Slice(left, Apple_1)") == "HandEmpty"
-    whole = world.render("plan", 200, 200).rgb
+    whole = world.cameras.render("plan", 200, 200).rgb
     _play(session, "GoTo(Knife_1)", "Pick(left, Knife_1)", "GoTo(Apple_1)")
     assert _code(session, "Slice(left, Apple_1)") == "NeedsSteadying"
     _play(session, "Hold(right, Apple_1)", "Slice(left, Apple_1)", "Release(right)")
-    assert world.object("Apple_1").state.isSliced and world.held("left") == "Knife_1" and world.parents("Apple_1") == (TABLE,)
-    parts = [part for _, part in world.part_of_geom["Apple_1"] if "slice" in part.options]
-    assert len(parts) >= 4 and (world.render("plan", 200, 200).rgb != whole).any()
+    assert (
+        world.object("Apple_1").state.isSliced
+        and world.grasps.held("left") == "Knife_1"
+        and world.containment.parents("Apple_1") == (TABLE,)
+    )
+    parts = [part for _, part in world.scene.part_of_geom["Apple_1"] if "slice" in part.options]
+    assert len(parts) >= 4 and (world.cameras.render("plan", 200, 200).rgb != whole).any()
     assert _code(session, "Slice(left, Apple_1)") == "AlreadyInState"
     assert _code(session, f"Slice(left, {TABLE})") == "NotSliceable"
 
@@ -110,8 +113,8 @@ def test_what_is_poured_arrives(robot: str) -> None:
     assert _code(session, f"Pour(right, {TABLE})") == "NotFillable"
     _play(session, "Pour(right, Bowl_1)")
     assert world.object("Bowl_1").state.fillLitres >= 0.9 * had and world.object("Bowl_1").state.fillLiquid == "wine"
-    assert world.object("Cup_1").state.fillLitres < 0.01 and world.held("right") == "Cup_1"
-    assert balance_l(world) == pytest.approx(0.0, abs=1e-9)
+    assert world.object("Cup_1").state.fillLitres < 0.01 and world.grasps.held("right") == "Cup_1"
+    assert world.liquids.balance_l() == pytest.approx(0.0, abs=1e-9)
     assert _code(session, "Pour(right, Bowl_1)") == "Empty"
 
 
@@ -123,19 +126,19 @@ def test_a_cup_stands_below_the_coffee_machine() -> None:
     assert _code(session, "Fill(right, Microwave_1)") == "NotFillable"
     _play(session, "GoTo(CoffeeMachine_1)", "Place(right, CoffeeMachine_1)", "ToggleOn(left, CoffeeMachine_1)")
     session.world.advance(4.0)
-    assert mug.state.fillLiquid == "coffee" and mug.state.fillLitres >= 0.9 * capacity_l(mug.type)
+    assert mug.state.fillLiquid == "coffee" and mug.state.fillLitres >= 0.9 * mug.type.volume_l
 
 
 @pytest.mark.parametrize("robot", ["h1", "x1"])
 def test_hold_leaves_things_where_they_are_and_release_lets_go(robot: str) -> None:
     session = _started(robot, [ObjectPlacement("Cup_1", TABLE, (1.5, -0.85))])
     world = session.world
-    before = world.pose("Cup_1")[:3, 3]
+    before = world.poses.pose("Cup_1")[:3, 3]
     _play(session, "GoTo(Cup_1)", "Hold(right, Cup_1)")
-    assert world.held("right") == "Cup_1" and np.linalg.norm(world.pose("Cup_1")[:3, 3] - before) < 0.03
+    assert world.grasps.held("right") == "Cup_1" and np.linalg.norm(world.poses.pose("Cup_1")[:3, 3] - before) < 0.03
     assert _code(session, "Hold(right, Cup_1)") == "HandOccupied"
     _play(session, "Release(right)")
-    assert world.held("right") is None and world.parents("Cup_1") == (TABLE,)
+    assert world.grasps.held("right") is None and world.containment.parents("Cup_1") == (TABLE,)
     assert _code(session, "Release(right)") == "HandEmpty"
 
 
@@ -143,7 +146,7 @@ def test_hold_leaves_things_where_they_are_and_release_lets_go(robot: str) -> No
 def test_a_held_handle_keeps_the_robot_in_its_place(robot: str) -> None:
     session = _started(robot, [])
     _play(session, "GoTo(Drawer_1)", "Hold(right, Drawer_1)")
-    assert session.world.held("right") == "Drawer_1"
+    assert session.world.grasps.held("right") == "Drawer_1"
     for move in ("MoveBack(0.2)", "MoveUp(0.1)", "MoveDown(0.1)", "RotateLeft(30)", "GoTo(Drawer_1)", "ResetArm(right)"):
         assert _code(session, move) == "InUse", move
     _play(session, "Release(right)", "MoveBack(0.1)", "GoTo(Drawer_1)", "Open(right, Drawer_1)")
@@ -153,7 +156,7 @@ def test_a_cup_is_filled_below_a_running_tap_and_carried_level() -> None:
     session = _started("h1", [ObjectPlacement("Mug_1", "CounterTop_1", (-0.5, 2.2))], states={"Faucet_1": {"isToggled": True}})
     mug = session.world.object("Mug_1")
     _play(session, "GoTo(Mug_1)", "Pick(right, Mug_1)", "GoTo(Faucet_1)", "Fill(right, Faucet_1)")
-    assert mug.state.fillLiquid == "water" and mug.state.fillLitres >= 0.95 * capacity_l(mug.type)
+    assert mug.state.fillLiquid == "water" and mug.state.fillLitres >= 0.95 * mug.type.volume_l
     assert session.world.object("SinkBasin_1").state.fillLitres > 0.0, "the tap also ran when nothing was below it"
-    assert balance_l(session.world) == pytest.approx(0.0, abs=1e-9)
+    assert session.world.liquids.balance_l() == pytest.approx(0.0, abs=1e-9)
     assert _code(session, "Fill(right, SinkBasin_1)") == "AlreadyInState"

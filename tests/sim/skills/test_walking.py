@@ -72,7 +72,7 @@ def test_walking_moves_the_legs_and_leaves_them_as_they_were(robot: str) -> None
     session.reset(FreePlay("living_room_1"), 0)
     world = session.world
     names = session.robot.leg_joints
-    before = np.array([world.joint_targets()[name] for name in names])
+    before = np.array([world.servos.joint_targets()[name] for name in names])
     sites = [int(world.model.site(f"{side}_sole").id) for side in ("left", "right")]
     knees, heights = [], []
 
@@ -85,7 +85,7 @@ def test_walking_moves_the_legs_and_leaves_them_as_they_were(robot: str) -> None
     assert feedback.success
     assert np.ptp(np.array(knees), axis=0).min() > 0.2, "both knees bend"
     assert np.array(heights).min() > -0.02 and np.array(heights).min(axis=1).max() < 0.05
-    after = np.array([world.joint_targets()[name] for name in names])
+    after = np.array([world.servos.joint_targets()[name] for name in names])
     np.testing.assert_allclose(after, before, atol=1e-3)
 
 

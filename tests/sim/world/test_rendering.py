@@ -26,7 +26,7 @@ def world() -> World:
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_every_camera_sees_something(world: World, camera: str) -> None:
-    view = world.render(camera, depth=True, segmentation=True)
+    view = world.cameras.render(camera, depth=True, segmentation=True)
     assert view.rgb.shape == (112, 112, 3) and view.rgb.dtype == np.uint8
     assert view.depth is not None and view.depth.dtype == np.float32 and np.isfinite(view.depth).all()
     assert view.segmentation is not None and len(np.unique(view.segmentation)) > 2
@@ -34,19 +34,19 @@ def test_every_camera_sees_something(world: World, camera: str) -> None:
 
 
 def test_depth_and_pose_reproject_to_the_object(world: World) -> None:
-    view = world.render("head", 224, 224, depth=True, segmentation=True)
+    view = world.cameras.render("head", 224, 224, depth=True, segmentation=True)
     assert view.depth is not None and view.segmentation is not None
     rows, columns = np.nonzero(view.segmentation == list(world.objects).index("Mug_1"))
     assert len(rows) > 20
     z = view.depth[rows, columns]
     rays = np.linalg.inv(view.intrinsics) @ np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
     points = (view.camera_in_world[:3, :3] @ (rays * z)).T + view.camera_in_world[:3, 3]
-    low, high = world.bounds("Mug_1")
+    low, high = world.poses.bounds("Mug_1")
     assert np.all(points > low - 0.02) and np.all(points < high + 0.02)
 
 
 def test_depth_agrees_with_a_ray_cast(world: World) -> None:
-    view = world.render("head", depth=True)
+    view = world.cameras.render("head", depth=True)
     assert view.depth is not None
     ray = np.linalg.inv(view.intrinsics) @ np.array([56.5, 40.5, 1.0])
     direction = view.camera_in_world[:3, :3] @ ray
@@ -60,14 +60,14 @@ def test_depth_agrees_with_a_ray_cast(world: World) -> None:
 
 
 def test_visible_objects(world: World) -> None:
-    seen = world.visible_objects()
+    seen = world.cameras.visible_objects()
     assert "Mug_1" in seen and "CounterTop_1" in seen
     assert "Apple_1" not in seen  # the table is behind the robot
-    assert "CounterTop_1" not in world.visible_objects(range_m=0.3)
+    assert "CounterTop_1" not in world.cameras.visible_objects(range_m=0.3)
 
 
 def test_agrees_with_mujocos_own_renderer(world: World) -> None:
-    view = world.render("left", 80, 100, depth=True, segmentation=True)
+    view = world.cameras.render("left", 80, 100, depth=True, segmentation=True)
     option = mujoco.MjvOption()
     option.sitegroup[:] = 0
     option.geomgroup[3:] = 0
@@ -89,20 +89,22 @@ def test_lamps_light_up() -> None:
 
 
 def test_two_sizes_and_repeated_pictures_are_equal(world: World) -> None:
-    assert np.array_equal(world.render().rgb, world.render().rgb)
-    assert world.render("front", 60, 90).rgb.shape == (60, 90, 3)
+    assert np.array_equal(world.cameras.render().rgb, world.cameras.render().rgb)
+    assert world.cameras.render("front", 60, 90).rgb.shape == (60, 90, 3)
 
 
 def test_labels_alone_are_those_of_a_picture(world: World) -> None:
     for camera in ("head", "behind", "plan"):
-        assert np.array_equal(world.labels(camera, 96, 128), world.render(camera, 96, 128, segmentation=True).segmentation)
+        assert np.array_equal(
+            world.cameras.labels(camera, 96, 128), world.cameras.render(camera, 96, 128, segmentation=True).segmentation
+        )
 
 
 def test_bad_requests_are_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="unknown camera 'rear'"):
-        world.render("rear")
+        world.cameras.render("rear")
     with pytest.raises(ValueError, match="image size 0"):
-        world.render("head", 0, 10)
+        world.cameras.render("head", 0, 10)
     monkeypatch.setenv("MUJOCO_GL", "vulkan")
     with pytest.raises(RenderingError, match="vulkan"):
         select_backend()
@@ -118,9 +120,9 @@ def _broken(*_: object) -> None:
 @pytest.mark.parametrize("room", ["kitchen_1", "bathroom_2"])
 def test_leaving_out_what_is_not_in_view_changes_no_pixel(room: str) -> None:
     world = World(load_robot("x1"), room)
-    renderer = Renderer(world, 96, 128)
+    renderer = Renderer(world.scene, 96, 128)
     for yaw in (0.0, 1.1, 2.5, -1.7):
-        world.put_base(*world.base_pose[:2], yaw)
+        world.grasps.put_base(*world.servos.base_pose[:2], yaw)
         for camera in CAMERAS:
             culled = renderer.view(camera, depth=True, segmentation=True)
             renderer._out_of_view = lambda _: np.zeros(world.model.ngeom, dtype=bool)  # type: ignore[method-assign]
@@ -135,21 +137,23 @@ def test_leaving_out_what_is_not_in_view_changes_no_pixel(room: str) -> None:
 def test_cameras_around_the_robot_see_it_and_the_head_sees_no_sky(room: str) -> None:
     world = World(load_robot("x1"), room, placements=[])
     for yaw in (0.0, 2.0, -2.0):
-        world.put_base(*world.base_pose[:2], yaw)
-        views = {camera: world.render(camera, 112, 112, segmentation=True) for camera in ("front", "left", "right", "behind")}
+        world.grasps.put_base(*world.servos.base_pose[:2], yaw)
+        views = {
+            camera: world.cameras.render(camera, 112, 112, segmentation=True) for camera in ("front", "left", "right", "behind")
+        }
         hidden = [camera for camera, view in views.items() if (view.segmentation == -2).sum() <= 250]
         assert len(hidden) <= 1, (hidden, yaw)  # furniture beside the robot may stand between
-        head = world.render("head", 112, 112, depth=True).depth
+        head = world.cameras.render("head", 112, 112, depth=True).depth
         assert head is not None and head.max() < 12.0, "walls and ceiling close the room"
 
 
 def test_canvases_that_are_given_up_harm_no_other() -> None:
     world = World(None, "bathroom_1")
-    view = world.render("overview", 40, 40, segmentation=True)
+    view = world.cameras.render("overview", 40, 40, segmentation=True)
     for size in range(41, 75):  # more than the process keeps
-        world.render("overview", size, size)
+        world.cameras.render("overview", size, size)
     world.close()
-    again = world.render("overview", 40, 40, segmentation=True)
+    again = world.cameras.render("overview", 40, 40, segmentation=True)
     assert np.array_equal(view.rgb, again.rgb) and np.array_equal(view.segmentation, again.segmentation)
     lamp = World(None, "living_room_1")
     assert len(np.unique(lamp.render("overview", 64, 64, segmentation=True).segmentation)) > 5

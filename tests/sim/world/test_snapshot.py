@@ -10,17 +10,18 @@ import pytest
 
 from sim.robots.spec import load_robot
 from sim.scene.objects import ObjectPlacement
+from sim.world.metadata import world_metadata
 from sim.world.world import World, WorldError
 
 
 def _trace(world: World) -> tuple[Any, ...]:
-    x = float(world.base_pose[0])
+    x = float(world.servos.base_pose[0])
     for k in range(20):
-        world.set_base_target(x=x + 0.01 * k)
-        world.set_hand("left", 1.0 - k / 20)
+        world.servos.set_base_target(x=x + 0.01 * k)
+        world.servos.set_hand("left", 1.0 - k / 20)
         world.advance(0.05)
     window = world.motion()
-    return world.data.qpos.copy(), world.data.qvel.copy(), window.key_bodies, world.rng.random(4), world.metadata()
+    return world.data.qpos.copy(), world.data.qvel.copy(), window.key_bodies, world.rng.random(4), world_metadata(world)
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -31,19 +32,19 @@ def _same(a: Any, b: Any) -> bool:
 def test_future_is_bit_equal_with_a_held_object(robot: str) -> None:
     world = World(load_robot(robot), "kitchen_1", seed=5)
     mug = world.object("Mug_1")
-    world.data.qpos[mug.qpos_adr : mug.qpos_adr + 3] = world.grasp_pose("right")[:3, 3]
+    world.data.qpos[mug.qpos_adr : mug.qpos_adr + 3] = world.servos.grasp_pose("right")[:3, 3]
     mujoco.mj_forward(world.model, world.data)
-    world.attach("right", "Mug_1")
-    world.set_state("Mug_1", "fillLiquid", "coffee")
+    world.grasps.attach("right", "Mug_1")
+    world.states.set_state("Mug_1", "fillLiquid", "coffee")
     world.advance(0.535)
     snapshot = world.save()
     first = _trace(world)
-    world.detach("right")
-    world.set_state("Mug_1", "isBroken", True)
-    world.set_state("Faucet_1", "isToggled", True)
+    world.grasps.detach("right")
+    world.states.set_state("Mug_1", "isBroken", True)
+    world.states.set_state("Faucet_1", "isToggled", True)
     world.advance(1.0)
     world.restore(snapshot)
-    assert world.held("right") == "Mug_1"
+    assert world.grasps.held("right") == "Mug_1"
     assert world.object("Mug_1").state.fillLiquid == "coffee"
     assert _same(first, _trace(world))
 
