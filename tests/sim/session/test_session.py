@@ -118,7 +118,7 @@ def test_luck_is_keyed_by_the_seed():
     made.reset(task, 0)
     saved = made.snapshot()
     for seed in range(3):
-        made._luck = type(made._luck)(made._luck.config, "hard", seed)
+        made._contingency = type(made._contingency)(made._contingency.config, "hard", seed)
         made.restore(saved)
         codes.add(made.draw(Action.parse("ToggleOn(left, StoveKnob_1)")))
     assert codes <= {"success", "nothing"}

@@ -104,7 +104,7 @@ def world():
     )
     made = World(load_robot("h1"), "bedroom_1", placements)
     yield made
-    made.close()
+    made.cameras.close()
 
 
 def test_metadata_tells_what_is_open(world):
@@ -145,12 +145,10 @@ def test_lids_stay_where_they_are_in_a_room_with_a_robot_that_moves(world):
 def test_a_load_does_not_weigh_on_the_lid(world):
     box = world.object("Box_1")
     before = world.model.body_mass[list(box.body_ids)].copy()
-    box.mass_kg = 3.0
-    world.refresh(box)
+    world.states.set_mass("Box_1", 3.0)
     now = world.model.body_mass[list(box.body_ids)]
     assert now.sum() == pytest.approx(3.0) and now[1] == before[1]
-    box.mass_kg = 0.3
-    world.refresh(box)
+    world.states.set_mass("Box_1", 0.3)
     assert world.model.body_mass[list(box.body_ids)] == pytest.approx(before)
 
 

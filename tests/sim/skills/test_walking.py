@@ -77,7 +77,7 @@ def test_walking_moves_the_legs_and_leaves_them_as_they_were(robot: str) -> None
     knees, heights = [], []
 
     def watch(seen, _text) -> None:
-        knees.append([seen.joint_positions()[name] for name in names if "knee" in name])
+        knees.append([seen.servos.joint_positions()[name] for name in names if "knee" in name])
         heights.append(seen.data.site_xpos[sites, 2].copy())
 
     session.watchers.append(watch)

@@ -82,9 +82,9 @@ def test_agrees_with_mujocos_own_renderer(world: World) -> None:
 
 def test_lamps_light_up() -> None:
     room = World(None, "living_room_1", [])
-    before = room.render("overview", 224, 224).rgb.astype(int)
-    room.set_state("Television_1", "isToggled", True)
-    after = room.render("overview", 224, 224).rgb.astype(int)
+    before = room.cameras.render("overview", 224, 224).rgb.astype(int)
+    room.states.set_state("Television_1", "isToggled", True)
+    after = room.cameras.render("overview", 224, 224).rgb.astype(int)
     assert np.abs(after - before).max() > 80
 
 
@@ -152,8 +152,8 @@ def test_canvases_that_are_given_up_harm_no_other() -> None:
     view = world.cameras.render("overview", 40, 40, segmentation=True)
     for size in range(41, 75):  # more than the process keeps
         world.cameras.render("overview", size, size)
-    world.close()
+    world.cameras.close()
     again = world.cameras.render("overview", 40, 40, segmentation=True)
     assert np.array_equal(view.rgb, again.rgb) and np.array_equal(view.segmentation, again.segmentation)
     lamp = World(None, "living_room_1")
-    assert len(np.unique(lamp.render("overview", 64, 64, segmentation=True).segmentation)) > 5
+    assert len(np.unique(lamp.cameras.render("overview", 64, 64, segmentation=True).segmentation)) > 5

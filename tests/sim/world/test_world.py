@@ -93,7 +93,7 @@ def test_recorder_runs_at_20_hz(world: World) -> None:
 def test_steps_of_any_multiple_give_the_same_future() -> None:
     a, b = World(load_robot("x1"), "kitchen_1"), World(load_robot("x1"), "kitchen_1")
     for w, dt in ((a, 0.02), (b, 0.1)):
-        w.set_base_target(x=0.0)
+        w.servos.set_base_target(x=0.0)
         for _ in range(round(1.0 / dt)):
             w.advance(dt)
     assert np.array_equal(a.data.qpos, b.data.qpos)
@@ -255,7 +255,7 @@ def test_fall_breaks_what_is_breakable() -> None:
 
 
 def test_metadata_has_ai2thor_names() -> None:
-    record = World(load_robot("x1"), "living_room_1").metadata()
+    record = world_metadata(World(load_robot("x1"), "living_room_1"))
     entry = record["objects"][0]
     names = """objectId objectType position rotation isOpen openness isToggled isPickedUp parentReceptacles receptacleObjectIds
         mass axisAlignedBoundingBox temperature isBroken isFilledWithLiquid isDirty"""
