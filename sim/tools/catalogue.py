@@ -1,4 +1,4 @@
-"""Lists types, rooms, robots, actions, failure codes and cameras: `python -m sim.scene.catalogue [--json]`.
+"""Lists types, rooms, robots, actions, failure codes and cameras: `python -m sim.tools.catalogue [--json]`.
 
 The user's own assets (`configs.assets`) are included. The JSON has the same entries with every field, and counts.
 """
@@ -146,7 +146,7 @@ def _print(parts: Mapping[str, Any], console: Console) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Prints the inventory; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m sim.scene.catalogue", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m sim.tools.catalogue", description=__doc__)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     wanted = parser.parse_args(arguments)
     try:

@@ -1,4 +1,4 @@
-"""`python -m sim.scene.catalogue`: what it lists is what exists."""
+"""`python -m sim.tools.catalogue`: what it lists is what exists."""
 
 from __future__ import annotations
 
