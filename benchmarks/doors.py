@@ -17,7 +17,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.feedback import ActionOutcome
 from data.interface.steps import Action, PlanStep
 from sim.scene.catalogue import MovingSpec

@@ -10,19 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-__all__ = ["ACTIONS", "ActionKind", "ActionSpec", "Arm"]
-
-
-class Arm(StrEnum):
-    """One of the robot's two arms."""
-
-    LEFT = "left"
-    RIGHT = "right"
-
-    @property
-    def other(self) -> Arm:
-        """The opposite arm."""
-        return Arm.RIGHT if self is Arm.LEFT else Arm.LEFT
+__all__ = ["ACTIONS", "ActionKind", "ActionSpec"]
 
 
 class ActionKind(StrEnum):

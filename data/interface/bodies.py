@@ -1,10 +1,11 @@
-"""Key bodies: the points of a body whose positions make up a motion frame, shared by all robots and by people."""
+"""Parts of the body that all robots share: the two arms, and the key bodies whose positions make up a motion frame."""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Final
 
-__all__ = ["KEY_BODIES", "SIDES"]
+__all__ = ["KEY_BODIES", "SIDES", "Arm"]
 
 #: Sides of the body, in the order of every array that has one entry per arm or leg.
 SIDES: Final = ("left", "right")
@@ -25,3 +26,15 @@ KEY_BODIES: Final = (
     "right_knee",
     "right_ankle",
 )
+
+
+class Arm(StrEnum):
+    """One of the robot's two arms."""
+
+    LEFT = "left"
+    RIGHT = "right"
+
+    @property
+    def other(self) -> Arm:
+        """The opposite arm."""
+        return Arm.RIGHT if self is Arm.LEFT else Arm.LEFT

@@ -8,7 +8,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from data.interface.actions import ACTIONS, ActionKind, ActionSpec, Arm
+from data.interface.actions import ACTIONS, ActionKind, ActionSpec
+from data.interface.bodies import Arm
 
 __all__ = ["Action", "ActionError", "PlanStep"]
 

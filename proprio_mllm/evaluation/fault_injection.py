@@ -25,7 +25,8 @@ from typing import Final
 
 import numpy as np
 
-from data.interface.actions import ActionKind, Arm
+from data.interface.actions import ActionKind
+from data.interface.bodies import Arm
 from data.interface.failures import FailureCategory
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation

@@ -11,7 +11,8 @@ import time
 
 import numpy as np
 
-from data.interface.actions import ACTIONS, ActionKind, Arm
+from data.interface.actions import ACTIONS, ActionKind
+from data.interface.bodies import Arm
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
 from data.interface.steps import Action, PlanStep

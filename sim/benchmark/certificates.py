@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from sim.tasks.families import family_of
 from sim.tasks.sample import ROBOTS
 from sim.tasks.task import BENCHMARK_PATH, MAX_STEPS, Task

@@ -21,7 +21,8 @@ from typing import Any, Final
 import numpy as np
 
 from configs.schema.collect import CollectConfig
-from data.interface.actions import ActionKind, Arm
+from data.interface.actions import ActionKind
+from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.observation import HistoryItem
 from data.interface.steps import Action, PlanStep

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs.schema.collect import CollectConfig
-from data.interface.actions import Arm
-from data.interface.bodies import SIDES
+from data.interface.bodies import SIDES, Arm
 from data.motion import encode_frames, world_to_heading
 from data.shards import encode_png
 from sim.robots.build_solver import robot_kit

@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.steps import Action, PlanStep
 from sim.expert.jobs import Facts, Job, plan_jobs

@@ -12,7 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from data.interface.actions import ACTIONS, ActionKind, Arm
+from data.interface.actions import ACTIONS, ActionKind
+from data.interface.bodies import Arm
 from data.interface.steps import Action
 
 __all__ = ["ALIASES", "ARGUMENTS", "number", "to_action"]

@@ -24,7 +24,7 @@ from typing import Any, Final
 import imageio.v3 as iio
 import numpy as np
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.feedback import ActionOutcome
 from data.interface.steps import PlanStep
 from sim.interfaces.aliases import to_action

@@ -17,7 +17,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from data.interface.actions import ActionKind, Arm
+from data.interface.actions import ActionKind
+from data.interface.bodies import Arm
 from data.interface.feedback import ActionOutcome, Feedback
 from data.interface.observation import HistoryItem, Observation
 from data.interface.steps import Action, PlanStep

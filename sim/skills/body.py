@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.steps import Action
 from sim.robots.arm_ik import PerArmSolver
 from sim.robots.build_solver import RobotKit, robot_kit

@@ -6,7 +6,7 @@ the object allows, then weight, then access. Reach is found out later, by the sk
 
 from __future__ import annotations
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from sim.robots.spec import HandSpec
 from sim.scene.objects import ObjectInstance
 from sim.skills.body import Body

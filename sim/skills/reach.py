@@ -13,7 +13,7 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from sim.skills.body import REACH_TOLERANCE_M, ArmGoal, Body
 from sim.skills.failures import SkillFailure

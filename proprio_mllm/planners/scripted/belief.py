@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.observation import HistoryItem
 from data.interface.steps import Action, ActionError
 

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from data.interface.actions import ACTIONS, ActionKind, Arm
+from data.interface.actions import ACTIONS, ActionKind
+from data.interface.bodies import Arm
 from data.interface.steps import Action
 from proprio_mllm.planners.scripted.belief import Belief
 from proprio_mllm.planners.scripted.words import Mention, type_of

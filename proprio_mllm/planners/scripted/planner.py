@@ -15,7 +15,8 @@ from typing import Final
 
 import numpy as np
 
-from data.interface.actions import ACTIONS, ActionKind, Arm
+from data.interface.actions import ACTIONS, ActionKind
+from data.interface.bodies import Arm
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
 from data.interface.steps import Action, PlanStep

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from data.interface.actions import ACTIONS, Arm
+from data.interface.actions import ACTIONS
+from data.interface.bodies import Arm
 from data.interface.feedback import ActionOutcome, Feedback
 from data.interface.steps import Action, ActionError, PlanStep
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from configs.schema.robot import RobotConfig
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.episode import Outcome
 from data.interface.observation import Camera, HistoryItem, Observation, Proprioception
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, run_episode

@@ -8,7 +8,7 @@ import pytest
 from configs.arguments import read_arguments
 from configs.schema.collect import CollectConfig
 from configs.validate import ConfigError
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.steps import Action, PlanStep
 from data.motion import N_FEATURES
 from data.shards import ShardReader, decode_depth, decode_png, decode_segmentation

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.steps import Action
 from sim.expert.expert import Expert
 from sim.expert.lookahead import Rehearsal

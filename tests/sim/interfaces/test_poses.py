@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.steps import Action
 from sim.interfaces.controller import Controller
 from sim.interfaces.poses import random_placements

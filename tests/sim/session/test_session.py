@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 import sim.robots
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.steps import Action, PlanStep
 from sim.scene.objects import ObjectPlacement

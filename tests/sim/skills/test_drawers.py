@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.steps import Action, PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.failures import FailureCategory
 from data.interface.steps import PlanStep
 from sim.robots.build_solver import robot_kit

@@ -12,7 +12,8 @@ from collections.abc import Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from typing import Final
 
-from data.interface.actions import ACTIONS, ActionKind, Arm
+from data.interface.actions import ACTIONS, ActionKind
+from data.interface.bodies import Arm
 from data.interface.steps import Action, ActionError
 from proprio_mllm.planners.chat.dag_plan.graph import Graph, Node, NodeKind, NodeReply
 from proprio_mllm.planners.chat.dag_plan.hands import EMPTY, Capacity, Hands

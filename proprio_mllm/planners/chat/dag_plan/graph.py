@@ -13,7 +13,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from data.interface.actions import ActionKind, Arm
+from data.interface.actions import ActionKind
+from data.interface.bodies import Arm
 from data.interface.steps import Action
 
 __all__ = ["Graph", "GraphReply", "Node", "NodeKind", "NodeReply", "RevisedGraph"]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from data.interface.actions import Arm
+from data.interface.bodies import Arm
 from data.interface.observation import Observation
 from proprio_mllm.planners.chat.dag_plan.hands import ARMS, Hands
 from proprio_mllm.planners.scripted.belief import Belief
