@@ -20,8 +20,6 @@ from configs.schema.train import TrainConfig
 
 logger = logging.getLogger("train")
 
-TRAINING_STAGES = ("base", "corrections", "pointmap", "tokenizer", "alignment", "selu")
-
 
 def make_data(cfg: TrainConfig) -> None:
     """Motions: generate or load, retarget to both robots, filter, replay with head-camera frames, write `clips` shards."""
@@ -78,17 +76,18 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
         make_data(cfg)
     if cfg.stage in ("all", "collect"):
         make_shards(cfg)
-    wanted = TRAINING_STAGES if cfg.stage == "all" else tuple(name for name in TRAINING_STAGES if name == cfg.stage)
-    if not wanted:
+    if cfg.stage in ("data", "collect"):
         return {}
     import torch
 
     from proprio_mllm.training.pipeline import Pipeline, StageError
+    from proprio_mllm.training.stages import STAGES
 
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
     command = " ".join(["python train.py", *sys.argv[1:]])
-    pipeline = Pipeline(cfg, _rollouts, command, _corrections)
+    pipeline = Pipeline(STAGES, cfg, _rollouts, command, _corrections)
+    wanted = tuple(STAGES) if cfg.stage == "all" else (cfg.stage,)
     metrics = {name: pipeline.run(name) for name in wanted}
     if cfg.release is not None:
         from proprio_mllm.training.release import export

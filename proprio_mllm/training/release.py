@@ -18,30 +18,22 @@ import platform
 import shutil
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from safetensors.torch import load_file, save_file
 
 from data.files import new_folder
 from proprio_mllm.model.building import share_backbone
 from proprio_mllm.training.paths import finished_key
-from proprio_mllm.training.selu import CRITIC
+from proprio_mllm.training.pipeline import Pipeline
 from proprio_mllm.training.sources import shard_hash
-
-if TYPE_CHECKING:
-    from proprio_mllm.training.pipeline import Pipeline
+from proprio_mllm.training.stages.selu import CRITIC
 
 __all__ = ["LARGEST_MB", "export", "find_model", "release_name"]
 
 #: Largest size of one released folder, megabytes.
 LARGEST_MB: Final = 30.0
 _MODELS: Final = ("base", "alignment", "selu")
-#: Stages that go into each released model, in order.
-_CHAIN: Final = {
-    "base": ("base",),
-    "alignment": ("base", "corrections", "pointmap", "tokenizer", "alignment"),
-    "selu": ("base", "corrections", "pointmap", "tokenizer", "alignment", "selu"),
-}
 
 
 def release_name(stage: str, variant: str) -> str:
@@ -67,13 +59,13 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
     """
     paths, written = pipeline.paths, list[Path]()
 
-    def current(stage: str) -> bool:
-        done = finished_key(paths.stage(stage))
-        return done is not None and done == pipeline.key(stage)
-
     for stage in _MODELS:
         source = paths.model(stage)
-        if not source.is_dir() or not all(map(current, _CHAIN[stage])) or (stage == "alignment" and current("selu")):
+        if (
+            not source.is_dir()
+            or not all(map(pipeline.is_current, pipeline.ancestors(stage)))
+            or (stage == "alignment" and pipeline.is_current("selu"))
+        ):
             continue
         key = pipeline.key(stage)
         target = Path(folder) / pipeline.cfg.model.name / release_name(stage, pipeline.cfg.variant)
@@ -118,7 +110,7 @@ def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
         if (folder / "manifest.json").is_file():
             shards[kind] = shard_hash(folder)
     stages = {}
-    for name in _CHAIN[stage]:
+    for name in pipeline.ancestors(stage):
         record = json.loads((pipeline.paths.stage(name) / "done.json").read_text(encoding="utf-8"))
         stages[name] = {"command": record.get("command", ""), "metrics": record["metrics"]}
     return {

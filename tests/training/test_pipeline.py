@@ -21,13 +21,15 @@ from data.interface.observation import Camera, Observation, Proprioception
 from data.shards import ShardError, ShardReader, ShardWriter
 from proprio_mllm.model.building import add_adapter, load_model
 from proprio_mllm.model.groups import train_only
-from proprio_mllm.training import pipeline as pipeline_module
 from proprio_mllm.training import release
 from proprio_mllm.training.alignment import PHASES, AlignmentObjective
-from proprio_mllm.training.pipeline import STAGES, Pipeline, StageError, variant_model
+from proprio_mllm.training.pipeline import Pipeline, StageError, variant_model
 from proprio_mllm.training.rollouts import CorrectionRequest, RolloutRequest, read_rollouts, rollout_row
-from proprio_mllm.training.selu import CRITIC, copy_adapter, train_adapter
 from proprio_mllm.training.sources import Demos, Exercises, shard_hash
+from proprio_mllm.training.stages import STAGES
+from proprio_mllm.training.stages.alignment import start
+from proprio_mllm.training.stages.inputs import correction_keys, demonstrations, text_rows
+from proprio_mllm.training.stages.selu import CRITIC, copy_adapter, train_adapter
 
 HELPERS = importlib.util.spec_from_file_location("training_helpers", Path(__file__).with_name("conftest.py"))
 assert HELPERS is not None
@@ -92,7 +94,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
     small = dataclasses.replace(cfg, model=_small(cfg.model))
     (root / "tiny").mkdir()
     shutil.copytree(shards, root / "tiny" / "data")
-    pipeline = Pipeline(small, collect, "python train.py stage=all", correct)
+    pipeline = Pipeline(STAGES, small, collect, "python train.py stage=all", correct)
     for stage in STAGES:
         assert pipeline.run(stage) is not None
     return pipeline
@@ -113,26 +115,27 @@ def test_current_stages_are_skipped_and_others_are_not(trained: Pipeline) -> Non
     assert trained.run("base") is None
     assert trained.run("selu") is None
     longer = dataclasses.replace(trained.cfg.pointmap, steps=5)
-    changed = Pipeline(dataclasses.replace(trained.cfg, pointmap=longer), collect)
+    changed = Pipeline(STAGES, dataclasses.replace(trained.cfg, pointmap=longer), collect)
     assert changed.key("base") == trained.key("base")
     assert changed.key("pointmap") != trained.key("pointmap")
     assert changed.key("alignment") != trained.key("alignment")
     more = dataclasses.replace(trained.cfg.corrections, episodes=5)
-    corrected = Pipeline(dataclasses.replace(trained.cfg, corrections=more), collect)
+    corrected = Pipeline(STAGES, dataclasses.replace(trained.cfg, corrections=more), collect)
     assert corrected.key("base") == trained.key("base")
     assert corrected.key("alignment") != trained.key("alignment")
 
 
 def test_a_new_recipe_makes_older_output_stale(trained: Pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     before = {name: trained.key(name) for name in ("base", "corrections", "tokenizer", "alignment", "selu")}
-    monkeypatch.setattr(pipeline_module, "RECIPES", dict(pipeline_module.RECIPES) | {"base": 99, "alignment": 1, "selu": 1})
+    for name, recipe in {"base": 99, "alignment": 1, "selu": 1}.items():
+        monkeypatch.setattr(type(STAGES[name]), "recipe", recipe)
     changed = {name for name in before if trained.key(name) != before[name]}
     assert changed == {"base", "corrections", "alignment", "selu"}
 
 
 def test_a_stage_names_what_it_needs(trained: Pipeline, tmp_path: Path) -> None:
     (tmp_path / "tiny").mkdir()
-    nothing = Pipeline(dataclasses.replace(trained.cfg, output=str(tmp_path)), collect)
+    nothing = Pipeline(STAGES, dataclasses.replace(trained.cfg, output=str(tmp_path)), collect)
     with pytest.raises(ShardError, match=r"no such file.*make them with `python train.py stage=data`"):
         nothing.run("base")
     (tmp_path / "tiny" / "data").symlink_to(trained.paths.shards("views").parent, target_is_directory=True)
@@ -161,15 +164,15 @@ def test_metrics_are_reported(trained: Pipeline) -> None:
 
 def test_corrections_follow_the_demonstrations(trained: Pipeline) -> None:
     model = trained.cfg.model
-    alone, joined = Demos(trained.paths.shards("demos"), model), trained.demos(model)
+    alone, joined = Demos(trained.paths.shards("demos"), model), demonstrations(trained, model)
     count = len(alone.motions)
     assert len(joined.motions) == count + 12
     assert [joined.target(i) for i in (0, count - 1)] == [alone.target(i) for i in (0, count - 1)]
     assert [joined.target(count + i) for i in range(12)] == [alone.target(i) for i in range(12)]
     assert {joined.reader[i]["episode"] for i in joined.finals} > {alone.reader[i]["episode"] for i in alone.finals}
     none = dataclasses.replace(trained.cfg, corrections=dataclasses.replace(trained.cfg.corrections, episodes=0))
-    assert len(Pipeline(none).demos(model).motions) == count
-    assert list(Pipeline(none).corrections) == ["corrections_in_words"]
+    assert len(demonstrations(Pipeline(STAGES, none), model).motions) == count
+    assert list(correction_keys(Pipeline(STAGES, none))) == ["corrections_in_words"]
 
 
 def test_half_of_the_steps_in_words_are_corrections(trained: Pipeline) -> None:
@@ -179,15 +182,15 @@ def test_half_of_the_steps_in_words_are_corrections(trained: Pipeline) -> None:
     def answers(exercises: Exercises) -> list[str]:
         return [exercises.draw(rng).messages[-1].text for _ in range(200)]
 
-    assert 70 < answers(trained.exercises(model, demos)).count("Lift(Box_1)") < 130
+    assert 70 < answers(text_rows(trained, model, demos)).count("Lift(Box_1)") < 130
     assert answers(Exercises(trained.paths.shards("exercises"), model, demos)).count("Lift(Box_1)") < 10
     alone = dataclasses.replace(trained.cfg, corrections=dataclasses.replace(trained.cfg.corrections, exercises=0))
-    assert Pipeline(alone).key("alignment") != trained.key("alignment")
-    assert Pipeline(alone).corrections["corrections"] == trained.corrections["corrections"]
+    assert Pipeline(STAGES, alone).key("alignment") != trained.key("alignment")
+    assert correction_keys(Pipeline(STAGES, alone))["corrections"] == correction_keys(trained)["corrections"]
 
 
 def test_the_control_trains_without_motion(trained: Pipeline) -> None:
-    control = Pipeline(dataclasses.replace(trained.cfg, variant="no_proprio"), collect)
+    control = Pipeline(STAGES, dataclasses.replace(trained.cfg, variant="no_proprio"), collect)
     assert control.run("alignment") is not None
     assert control.run("selu") is not None
     model = load_model(control.paths.model("selu"))
@@ -223,7 +226,7 @@ def test_a_phase_changes_only_its_groups(trained: Pipeline, phase: str) -> None:
     from proprio_mllm.training.alignment import AlignmentData
     from proprio_mllm.training.sources import Clips, Exercises, Judgements, Views
 
-    model = trained._start_alignment()
+    model = start(trained)
     shards, cfg = trained.paths.shards, trained.cfg.alignment
     tokenizer = MotionTokenizer.load(trained.paths.model("tokenizer"))
     views, demos = Views(shards("views"), model.cfg), Demos(shards("demos"), model.cfg)
@@ -268,7 +271,7 @@ def test_the_same_seed_gives_the_same_weights(trained: Pipeline, shards: Path, t
     """Initial weights included: whatever was drawn before, here a number, makes no difference."""
     torch.manual_seed(12345)
     shutil.copytree(shards, tmp_path / "tiny" / "data")
-    again = Pipeline(dataclasses.replace(trained.cfg, output=str(tmp_path)), collect, "", correct)
+    again = Pipeline(STAGES, dataclasses.replace(trained.cfg, output=str(tmp_path)), collect, "", correct)
     for stage in ("base", "corrections", "pointmap", "tokenizer", "alignment"):
         again.run(stage)
         torch.rand(1)
@@ -284,13 +287,13 @@ def test_a_stage_that_is_stopped_is_not_finished(trained: Pipeline, tmp_path: Pa
     """Not even under the configuration that had finished: the folder holds something else by now."""
     shutil.copytree(trained.cfg.output, tmp_path / "run")
     cfg = dataclasses.replace(trained.cfg, output=str(tmp_path / "run"))
-    longer = Pipeline(dataclasses.replace(cfg, pointmap=dataclasses.replace(cfg.pointmap, steps=9)))
+    longer = Pipeline(STAGES, dataclasses.replace(cfg, pointmap=dataclasses.replace(cfg.pointmap, steps=9)))
     monkeypatch.setattr(longer, "loop", _stopped)
     with pytest.raises(KeyboardInterrupt):
         longer.run("pointmap")
     with pytest.raises(StageError, match=r"run `python train\.py stage=pointmap` first"):
-        Pipeline(dataclasses.replace(cfg, overwrite=True)).run("alignment")
-    assert [path.name for path in release.export(Pipeline(cfg), tmp_path / "weights")] == ["base"]
+        Pipeline(STAGES, dataclasses.replace(cfg, overwrite=True)).run("alignment")
+    assert [path.name for path in release.export(Pipeline(STAGES, cfg), tmp_path / "weights")] == ["base"]
 
 
 def _stopped(*_: object) -> None:
@@ -361,3 +364,32 @@ def test_configurations_compose(budget: str, model: str) -> None:
 def test_wrong_overrides_name_what_is_allowed(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         build(TrainConfig, compose("train", [override]))
+
+
+class _Counting:
+    """A stage of one's own: counts the rows of the demonstrations."""
+
+    name = "counting"
+    needs = ("base",)
+    shards = ("demos",)
+    recipe = 1
+
+    def settings(self, pipeline: Pipeline) -> dict[str, int]:
+        return {"seed": pipeline.cfg.seed}
+
+    def run(self, pipeline: Pipeline, folder: Path, key: str) -> dict[str, float]:
+        assert folder.name == "counting" and key == pipeline.key("counting")
+        return {"rows": float(len(ShardReader(pipeline.paths.shards("demos"), "demos")))}
+
+
+def test_a_stage_of_ones_own_is_one_class_and_one_entry(trained: Pipeline, tmp_path: Path) -> None:
+    shutil.copytree(trained.cfg.output, tmp_path / "run")
+    cfg = dataclasses.replace(trained.cfg, output=str(tmp_path / "run"))
+    pipeline = Pipeline({**STAGES, "counting": _Counting()}, cfg)
+    assert pipeline.ancestors("counting") == ("base", "counting")
+    metrics = pipeline.run("counting")
+    assert metrics is not None and metrics["rows"] > 0
+    assert pipeline.run("counting") is None
+    assert pipeline.run("base") is None
+    with pytest.raises(ValueError, match=r"stage 'sleep' has no key; allowed: base, .*, counting"):
+        pipeline.key("sleep")

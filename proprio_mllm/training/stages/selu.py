@@ -1,4 +1,4 @@
-"""`stage=selu` (paper, stage 3): the actor explores, the critic judges and relabels, both learn from what is kept.
+"""Stage `selu` (paper, stage 3): the actor explores, the critic judges and relabels, both learn from what is kept.
 
 Actor and critic are two LoRA adapters over the stage-2 model: the actor goes on with stage 2's adapter, the critic starts as
 its copy. A round: roll the actor out with a temperature, judge every end, ask oneself and relabel failures keeping the verb,
@@ -10,12 +10,13 @@ proportion of stage 2; the abstract of SELU mentions no replay.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,13 +42,12 @@ from proprio_mllm.training.critic import (
 from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.goals import Relabel
 from proprio_mllm.training.paths import finish, finished_key
+from proprio_mllm.training.pipeline import Metrics, Pipeline
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
 from proprio_mllm.training.sources import Bodies, Judgements
+from proprio_mllm.training.stages.inputs import demonstrations, text_rows
 
-if TYPE_CHECKING:
-    from proprio_mllm.training.pipeline import Pipeline
-
-__all__ = ["ACTOR", "CRITIC", "ExampleObjective", "copy_adapter", "run_selu", "train_adapter"]
+__all__ = ["ACTOR", "CRITIC", "ExampleObjective", "SeluStage", "copy_adapter", "train_adapter"]
 
 logger = logging.getLogger(__name__)
 
@@ -150,9 +150,9 @@ class _Selu:
             add_adapter(self.model, CRITIC)
             copy_adapter(self.model, ACTOR, CRITIC)
         self.collator = Collator(self.model.processor, self.model.cfg)
-        self.demos = self.pipeline.demos(self.model.cfg)
+        self.demos = demonstrations(self.pipeline, self.model.cfg)
         self.judgements = Judgements(self.pipeline.paths.shards("judgements"), self.model.cfg)
-        self.exercises = self.pipeline.exercises(self.model.cfg, self.demos)
+        self.exercises = text_rows(self.pipeline, self.model.cfg, self.demos)
         self._tokens = None if self.tokenizer is None else self.demos.tokens(self.tokenizer)
         self._bodies = None if self._tokens is None else Bodies(self.demos, self._tokens)
 
@@ -227,21 +227,32 @@ class _Selu:
         return metrics
 
 
-def run_selu(pipeline: Pipeline, folder: Path, key: str, collect: RolloutCollector) -> dict[str, float]:
-    """Runs the rounds, continuing an interrupted one, and stores the last round's model.
+class SeluStage:
+    """Rounds of acting, judging, relabelling and learning."""
 
-    Args:
-        pipeline: gives configuration, folders and the loop.
-        folder: of this stage.
-        key: of this stage.
-        collect: runs an actor in the simulator.
-    """
-    run = _Selu(pipeline, folder, key, collect)
-    metrics: dict[str, float] = {}
-    for number in range(pipeline.cfg.selu.rounds):
-        metrics |= {f"round{number}_{name}": value for name, value in run.round(number).items()}
-    last = folder / f"round_{pipeline.cfg.selu.rounds - 1}" / "model"
-    model = load_model(last, ACTOR)
-    tokenizer = MotionTokenizer.load(last / "motion") if model.cfg.proprioception else None
-    save_model(model, pipeline.paths.model("selu"), tokenizer)
-    return metrics
+    name = "selu"
+    needs = ("alignment",)
+    shards = ()
+    recipe = 4
+
+    def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
+        """The rounds."""
+        return {"selu": dataclasses.asdict(pipeline.cfg.selu)}
+
+    def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
+        """Runs the rounds, continuing an interrupted one, and stores the last round's model.
+
+        Raises:
+            ValueError: without a collector of rollouts.
+        """
+        if pipeline.collect_rollouts is None:
+            raise ValueError("stage 'selu' needs rollouts: no collector was given")
+        rounds = _Selu(pipeline, folder, key, pipeline.collect_rollouts)
+        metrics: Metrics = {}
+        for number in range(pipeline.cfg.selu.rounds):
+            metrics |= {f"round{number}_{name}": value for name, value in rounds.round(number).items()}
+        last = folder / f"round_{pipeline.cfg.selu.rounds - 1}" / "model"
+        model = load_model(last, ACTOR)
+        tokenizer = MotionTokenizer.load(last / "motion") if model.cfg.proprioception else None
+        save_model(model, pipeline.paths.model("selu"), tokenizer)
+        return metrics

@@ -1,0 +1,79 @@
+"""Stage `alignment` (paper, stage 2): motion joins images and text, first alone, then all together, through LoRA."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors.torch import load_file
+
+from proprio_mllm.model.building import add_adapter, build_model, build_point_map, build_processor, load_model, save_model
+from proprio_mllm.model.groups import train_only
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, body_state_accuracy
+from proprio_mllm.training.base import exercise_accuracy, grounding_accuracy, plan_accuracy
+from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded, variant_model
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Judgements, Views
+from proprio_mllm.training.stages.inputs import demonstrations, text_rows
+
+__all__ = ["AlignmentStage", "start"]
+
+
+class AlignmentStage:
+    """The phases of `PHASES`, each a loop over its own parameter groups."""
+
+    name = "alignment"
+    needs = ("base", "corrections", "pointmap", "tokenizer")
+    shards = ("judgements",)
+    recipe = 5
+
+    def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
+        """The phases and the variant's model."""
+        cfg = pipeline.cfg
+        model = dataclasses.asdict(variant_model(cfg.model, cfg.variant))
+        return {"alignment": dataclasses.asdict(cfg.alignment), "model": model}
+
+    def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
+        """Trains and stores the variant's model, and measures grounding, body state and planning."""
+        model = start(pipeline)
+        tokenizer = MotionTokenizer.load(pipeline.paths.model("tokenizer"))
+        views, demos = Views(pipeline.paths.shards("views"), model.cfg), demonstrations(pipeline, model.cfg)
+        exercises = text_rows(pipeline, model.cfg, demos)
+        judgements = Judgements(pipeline.paths.shards("judgements"), model.cfg)
+        clips = Clips(pipeline.paths.shards("clips"))
+        data = AlignmentData(model, tokenizer, clips, views, demos, exercises, judgements, pipeline.cfg.alignment)
+        # without proprioception there is nothing to align apart
+        wanted = PHASES if model.cfg.proprioception else ("joint",)
+        loops = {phase: getattr(pipeline.cfg.alignment, phase) for phase in wanted}
+        for phase, loop in loops.items():
+            train_only(model, PHASES[phase].groups)
+            pipeline.loop(
+                AlignmentObjective(model, data, phase, pipeline.cfg.alignment, f"{key}/{phase}"), loop, folder / phase
+            )
+        read = tokenizer if model.cfg.proprioception else None
+        save_model(model.eval(), pipeline.paths.model("alignment"), read)
+        asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
+        felt = body_state_accuracy(model, demos, read) if read is not None else {}
+        return {**asked, **felt, **plan_accuracy(model, demos, read), **exercise_accuracy(model, exercises, data.bodies)}
+
+
+def start(pipeline: Pipeline) -> ProprioMLLM:
+    """The base model with this variant's MPE and CSE and the trained point map."""
+    cfg = variant_model(pipeline.cfg.model, pipeline.cfg.variant)
+    point_map = None
+    if cfg.cse.enabled:
+        point_map = seeded(lambda: build_point_map(cfg), pipeline.cfg.seed)
+        if point_map is not None and cfg.point_map.encoder == "sim":
+            point_map.load_state_dict(load_file(pipeline.paths.stage("pointmap") / "checkpoint" / "model.safetensors"))
+    if cfg.weights is None:
+        base = load_model(pipeline.paths.model("base"))
+        local = dataclasses.replace(cfg, weights=str(pipeline.paths.model("base") / "vlm"))
+        model = build_model(local, base.processor, pipeline.cfg.seed, point_map)
+        model.cfg = cfg
+    else:
+        model = build_model(cfg, build_processor(cfg), pipeline.cfg.seed, point_map)
+    seeded(lambda: add_adapter(model), pipeline.cfg.seed)
+    return model

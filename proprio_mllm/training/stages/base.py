@@ -1,0 +1,62 @@
+"""Stage `base`: the plain backbone learns to see and to plan; stands in for the pretraining of Qwen2.5-VL."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from proprio_mllm.model.building import build_model, build_processor, save_model
+from proprio_mllm.model.dense import DenseHead
+from proprio_mllm.model.groups import train_only
+from proprio_mllm.training.base import DenseObjective, JointObjective, exercise_accuracy, grounding_accuracy, plan_accuracy
+from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config, seeded
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Views
+from proprio_mllm.training.text import corpus, start_from_words, whole_words
+
+__all__ = ["BaseStage"]
+
+logger = logging.getLogger(__name__)
+
+
+class BaseStage:
+    """Dense grounding first, then grounding, planning and text together, all weights training."""
+
+    name = "base"
+    needs = ()
+    shards = ("views", "exercises", "demos", "clips")
+    recipe = 3
+
+    def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
+        """Of the tokenizer only the words: no stage before it, and no motion in its prompts."""
+        model = pipeline.cfg.model
+        plain = dataclasses.asdict(base_model_config(model)) | {"motion": model.motion.vocabulary}
+        return {"base": dataclasses.asdict(pipeline.cfg.base), "model": plain}
+
+    def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
+        """Trains and stores the base model; nothing to do where pretrained weights are given."""
+        cfg, plain = pipeline.cfg, base_model_config(pipeline.cfg.model)
+        if cfg.model.weights is not None:
+            logger.info("base: %s has pretrained weights, nothing to do", cfg.model.name)
+            return {}
+        views, demos = Views(pipeline.paths.shards("views"), plain), Demos(pipeline.paths.shards("demos"), plain)
+        clips = Clips(pipeline.paths.shards("clips"))
+        exercises = Exercises(pipeline.paths.shards("exercises"), plain, demos)
+        texts = corpus(plain, views, demos, exercises, clips, cfg.seed)
+        model = build_model(plain, build_processor(plain, texts, whole_words(views)), cfg.seed)
+        start_from_words(model, views.type_names)
+        head = seeded(lambda: DenseHead(model, views.type_names), cfg.seed)
+        model.requires_grad_(True)
+        dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
+        chosen = {id(p) for p in train_only(model, ("vision", "merger", "rows"))} | {id(p) for p in head.parameters()}
+        for parameter in dense.module.parameters():
+            parameter.requires_grad_(id(parameter) in chosen)
+        pipeline.loop(dense, cfg.base.dense, folder / "dense")
+        model.requires_grad_(True)
+        joint = JointObjective(model, head, views, demos, exercises, clips, cfg.base, f"{key}/joint")
+        pipeline.loop(joint, cfg.base.joint, folder / "joint")
+        save_model(model.eval(), pipeline.paths.model("base"))
+        asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE))
+        return {**asked, **plan_accuracy(model, demos), **exercise_accuracy(model, exercises)}
