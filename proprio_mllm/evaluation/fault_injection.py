@@ -142,12 +142,12 @@ def _wrong_place(now: Moment) -> Script | None:
     if now.walk is None or now.intent is None:
         return None
     world = now.session.world
-    target = np.asarray(now.session.body.interaction_point(now.intent.object_id or ""))[:2]
+    target = np.asarray(now.session.body.objects.interaction_point(now.intent.object_id or ""))[:2]
     away = [
         name
         for name in sorted(world.objects)
         if not world.objects[name].movable
-        and float(np.linalg.norm(np.asarray(now.session.body.interaction_point(name))[:2] - target)) > 2.5
+        and float(np.linalg.norm(np.asarray(now.session.body.objects.interaction_point(name))[:2] - target)) > 2.5
     ]
     if not away:
         return None
@@ -182,7 +182,7 @@ def _useful_change(now: Moment) -> float | None:
     change = now.proposed.actions[0]
     if change.name not in _HEIGHT_CHANGES or now.intent is None or change.amount is None:
         return None
-    height_m = now.session.body.pelvis_height_m + (change.amount if change.name == "MoveUp" else -change.amount)
+    height_m = now.session.body.posture.pelvis_height_m + (change.amount if change.name == "MoveUp" else -change.amount)
     needed = now.session.assess(now.intent) is not None and not now.refused_at(now.intent, height_m)
     return height_m if needed else None
 
@@ -199,7 +199,7 @@ def _wrong_way(now: Moment) -> Script | None:
     if _useful_change(now) is None or now.intent is None:
         return None
     low, high = now.heights_m
-    present, up = now.session.body.pelvis_height_m, now.proposed.actions[0].name == "MoveDown"
+    present, up = now.session.body.posture.pelvis_height_m, now.proposed.actions[0].name == "MoveDown"
     room = high - present if up else present - low
     if room < 0.02 or not now.refused_at(now.intent, high if up else low):
         return _forever(f"{'MoveUp' if up else 'MoveDown'}(0.3)", now.intent.to_text())
@@ -215,7 +215,7 @@ def _to_the_end(now: Moment, low_end: bool) -> tuple[Action, float] | None:
     """The proposed arm action and the way to the end of the legs' range, where the arm does not do it from that end."""
     action = now.arm_action
     low, high = now.heights_m
-    present = now.session.body.pelvis_height_m
+    present = now.session.body.posture.pelvis_height_m
     room = present - low if low_end else high - present
     if action is None or action.object_id is None or room < 0.05 or not now.refused_at(action, low if low_end else high):
         return None
@@ -296,7 +296,7 @@ def _forgets_to_open(now: Moment) -> Script | None:
     door = next((action for action in now.proposed.actions if action.name == "Open"), None)
     if door is None or any(goal.kind == "open" and goal.object_id == door.object_id for goal in now.task.goals):
         return None
-    held = now.session.body.held
+    held = now.session.body.hands.held
     loaded = next((arm for arm in (Arm.RIGHT, Arm.LEFT) if held[arm] is not None), None)
     if loaded is not None:
         return _forever(Action("Place", loaded, door.object_id).to_text())
@@ -312,7 +312,7 @@ def _full_hand(now: Moment) -> Script | None:
     action = now.arm_action
     if action is None or action.name not in ("Pick", "Open", "Close", "ToggleOn", "ToggleOff"):
         return None
-    held = now.session.body.held
+    held = now.session.body.hands.held
     full = next((arm for arm in (Arm.RIGHT, Arm.LEFT) if held[arm] is not None), None)
     return None if full is None else _forever(dataclasses.replace(action, arm=full).to_text())
 
@@ -335,9 +335,9 @@ def _opposite(now: Moment) -> Script | None:
 
 def _lets_go(now: Moment) -> Script | None:
     """Drops what it has just taken, and thinks that all is done."""
-    held = now.session.body.held
+    held = now.session.body.hands.held
     arm = next((arm for arm in (Arm.RIGHT, Arm.LEFT) if held[arm] is not None), None)
-    if arm is None or now.session.body.lifted is not None:
+    if arm is None or now.session.body.hands.lifted is not None:
         return None
     return iter((Action("Release", arm).to_text(), *["Done()"] * 50))
 
@@ -406,7 +406,7 @@ def _reaches_too_soon(now: Moment) -> str | None:
 
 
 def _puts_down_nothing(now: Moment) -> str | None:
-    if now.intent is None or any(now.session.body.held.values()):
+    if now.intent is None or any(now.session.body.hands.held.values()):
         return None
     return f"Place(right, {now.intent.object_id})"
 

@@ -23,7 +23,7 @@ from data.shards import encode_png
 from sim.robots.build_solver import robot_kit
 from sim.scene.catalogue import load_catalogue
 from sim.scene.compiler import BASE_JOINTS
-from sim.skills.body import ready_posture
+from sim.skills.body.ready import ready_posture
 from sim.skills.obstacles import navigation_map
 from sim.tasks.drafts import NoDraft
 from sim.tasks.families import FAMILIES, draw

@@ -154,10 +154,10 @@ class Expert:
         """What the planner reads from the simulator."""
         session = self._session
         objects = {entry["objectId"]: entry for entry in world_metadata(session.world)["objects"]}
-        lifted = session.body.lifted
+        lifted = session.body.hands.lifted
         heavy = session.world.containment.needs_two_hands
         two_handed = frozenset(name for name, item in session.world.objects.items() if item.movable and heavy(name))
-        held = {arm: None if item == lifted else item for arm, item in session.body.held.items()}
+        held = {arm: None if item == lifted else item for arm, item in session.body.hands.held.items()}
         things = session.world.objects
         links = session.world.room.links
         return Facts(
@@ -228,7 +228,7 @@ class Expert:
     # ---- memory
 
     def _here(self) -> _Place:
-        return _Place(self._session.body.commanded_base(), self._session.body.pelvis_height_m)
+        return _Place(self._session.body.posture.stance(), self._session.body.posture.pelvis_height_m)
 
     def _refused_here(self, action: Action) -> _Refusal | None:
         """Why an action does not work from here; what the physics decided weighs more than what was thought."""
@@ -350,7 +350,7 @@ class Expert:
 
     def _stances_for_two(self, target: str, tried: Collection[str]) -> Iterator[tuple[Action | None, Stance]]:
         """Where two arms might work on a target: here, without an action, then where walks would end."""
-        yield None, self._session.body.commanded_base()
+        yield None, self._session.body.posture.stance()
         for distance, bearing in _STANCES:
             option = Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
             stance = None if option.to_text() in tried else self._rehearsal.stance_of(option)
@@ -383,9 +383,12 @@ class Expert:
         history, body = self._session.history, self._session.body
         if not history or not history[-1].feedback.endswith(FailureCode.BLOCKED_PATH.value):
             return False
-        base = body.commanded_base()
+        base = body.posture.stance()
         behind = base.position - _BACK_M * np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
-        return not history[-1].step.startswith("Move") and body.navigation().free_travel(base.position, behind) > 0.9 * _BACK_M
+        return (
+            not history[-1].step.startswith("Move")
+            and body.workspace.navigation().free_travel(base.position, behind) > 0.9 * _BACK_M
+        )
 
     def _goes_with(self, head: Job, other: Job) -> bool:
         """Whether two jobs might be done at once, by one arm each."""
@@ -395,7 +398,7 @@ class Expert:
         if other.target not in self._session.known_objects:
             return False
         body = self._session.body
-        gap = body.interaction_point(head.target)[:2] - body.interaction_point(other.target)[:2]
+        gap = body.objects.interaction_point(head.target)[:2] - body.objects.interaction_point(other.target)[:2]
         return len(self._usable) == 2 and float(np.hypot(*gap)) < _TOGETHER_M
 
     def _approach(self, job: Job, verdicts: Sequence[SkillFailure], facts: Facts) -> Action:
@@ -431,7 +434,7 @@ class Expert:
             stance = self._rehearsal.stance_of(option)
             if stance is None:
                 continue
-            place = _Place(stance, self._session.body.pelvis_height_m)
+            place = _Place(stance, self._session.body.posture.pelvis_height_m)
             if any(what == known and place.near(other) for known, other in self._memory.barren):
                 continue
             looked += 1
@@ -447,7 +450,7 @@ class Expert:
     def _rise_m(self, job: Job) -> float:
         """How much higher a load has to be carried so as not to run into the furniture it is brought to."""
         world, body = self._session.world, self._session.body
-        load = body.lifted or (None if job.arm is None else body.held[job.arm])
+        load = body.hands.lifted or (None if job.arm is None else body.hands.held[job.arm])
         thing = world.objects[job.target]
         if not job.verb.startswith("Place") or load is None or (thing.type.encloses and not thing.type.lidded):
             return 0.0
@@ -455,12 +458,12 @@ class Expert:
         if spot is None:
             return 0.0
         missing = float(spot[2]) + _OVER_EDGE_M - float(world.poses.bounds(load)[0][2])
-        return min(missing, body.spec.pelvis_height_range_m[1] - body.pelvis_height_m)
+        return min(missing, body.spec.pelvis_height_range_m[1] - body.posture.pelvis_height_m)
 
     def _height_change(self, height_m: float) -> Action:
         """The change of pelvis height, rounded away from zero to the grid, as far as the legs go."""
         low, high = self._session.body.spec.pelvis_height_range_m
-        present = self._session.body.pelvis_height_m
+        present = self._session.body.posture.pelvis_height_m
         room = high - present if height_m > 0 else present - low
         steps = max(1, int(np.ceil(abs(height_m) / HEIGHT_STEP_M - 0.1)))
         amount = max(0.01, round(min(steps * HEIGHT_STEP_M, room), 2))
@@ -482,8 +485,8 @@ class Expert:
         return Action("MoveBack", amount=0.3) if attempt % 3 else Action("MoveUp", amount=0.2)
 
     def _bearing_rad(self, object_id: str) -> float:
-        base = self._session.body.base()
-        delta = self._session.body.interaction_point(object_id)[:2] - base.position
+        base = self._session.body.base.measured()
+        delta = self._session.body.objects.interaction_point(object_id)[:2] - base.position
         return wrap_angle(float(np.arctan2(delta[1], delta[0])) - base.yaw_rad)
 
     def _is_far(self, object_id: str) -> bool:

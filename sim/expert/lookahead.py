@@ -43,13 +43,13 @@ class Rehearsal:
         assert action.object_id is not None
         bearing = np.deg2rad(action.bearing_deg) if action.bearing_deg is not None else 0.0
         found = best_stance(
-            body.navigation(),
-            body.commanded_base(),
-            body.interaction_point(action.object_id)[:2],
-            body.comfortable_distance_m(),
+            body.workspace.navigation(),
+            body.posture.stance(),
+            body.objects.interaction_point(action.object_id)[:2],
+            body.workspace.comfortable_distance_m(),
             action.amount,
             bearing,
-            body.faces_rad(action.object_id),
+            body.objects.faces_rad(action.object_id),
             body.fits,
         )
         return None if found is None else found[0]
@@ -61,7 +61,7 @@ class Rehearsal:
             actions: the same action for different arms.
             stance: where the robot would stand.
         """
-        height = self._session.body.pelvis_height_m
+        height = self._session.body.posture.pelvis_height_m
         with self._in_thought():
             for candidate in self._heights(actions, stance, height):
                 self._put(stance, candidate)
@@ -94,8 +94,8 @@ class Rehearsal:
         body = self._session.body
         if action.name == "Place" or action.arm is None or action.object_id is None:
             return True
-        self._put(stance, body.pelvis_height_m)
-        return body.within(action.arm, body.interaction_point(action.object_id), height_m)
+        self._put(stance, body.posture.pelvis_height_m)
+        return body.ik.within(action.arm, body.objects.interaction_point(action.object_id), height_m)
 
     def might_lead_to(self, first: Action, then: Action, stance: Stance, height_m: float) -> bool:
         """Whether it is worth acting out an action, to see whether it leads to another one; asks kinematics only.
@@ -143,8 +143,8 @@ class Rehearsal:
         session = self._session
         with session.imagining():
             if stance is not None or height_m is not None:
-                base = session.body.commanded_base() if stance is None else stance
-                self._put(base, session.body.pelvis_height_m if height_m is None else height_m)
+                base = session.body.posture.stance() if stance is None else stance
+                self._put(base, session.body.posture.pelvis_height_m if height_m is None else height_m)
             if session.assess(first, diagnose=False) is not None:
                 return False
             # it also looks: what was shut away is known afterwards
@@ -154,7 +154,7 @@ class Rehearsal:
     def heights_m(self) -> list[float]:
         """Pelvis heights worth trying, the present one first, then the nearest."""
         low, high = self._session.body.spec.pelvis_height_range_m
-        present = self._session.body.pelvis_height_m
+        present = self._session.body.posture.pelvis_height_m
         grid = [present + step * HEIGHT_STEP_M for step in (0, 1, -1, 2, -2, 4, -4, 6, -6, 8, -8)]
         return [height for height in grid if low - 0.001 <= height <= high + 0.001]
 
@@ -169,9 +169,9 @@ class Rehearsal:
         assert first.object_id is not None
         if first.arm is None or first.name == "Place":
             return grid[:_HEIGHTS]
-        point = body.interaction_point(first.object_id)
+        point = body.objects.interaction_point(first.object_id)
         self._put(stance, present_m)
-        within = [h for h in grid if any(a.arm is not None and body.within(a.arm, point, h) for a in actions)]
+        within = [h for h in grid if any(a.arm is not None and body.ik.within(a.arm, point, h) for a in actions)]
         return within[:_HEIGHTS]
 
     def _put(self, stance: Stance, height_m: float) -> None:

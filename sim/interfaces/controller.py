@@ -270,7 +270,7 @@ class Controller:
         return name
 
     def _reachable(self) -> list[dict[str, float]]:
-        points = self.session.body.navigation().free_positions()[::9]
+        points = self.session.body.workspace.navigation().free_positions()[::9]
         return [{"x": float(x), "y": float(y), "z": 0.0} for x, y in points]
 
     def _interactable(self, call: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -326,7 +326,7 @@ class Controller:
             rotation = rotation.get("z", 0.0)
         yaw = wrap_angle(float(np.deg2rad(np.remainder(number("TP", "rotation", rotation), 360.0))))
         body = self.session.body
-        if body.at_furniture() or not body.navigation().is_free(np.array([x, y])):
+        if body.hands.at_furniture() or not body.workspace.navigation().is_free(np.array([x, y])):
             return False
         self._undo.append(self.session.snapshot())
         self._redo.clear()
@@ -367,7 +367,7 @@ class Controller:
                 }
                 for outcome in outcomes
             ],
-            "arm": {arm.value: {"heldObject": held} for arm, held in session.body.held.items()},
+            "arm": {arm.value: {"heldObject": held} for arm, held in session.body.hands.held.items()},
         }
         palette = _palette(len(session.world.objects))
         colors = np.concatenate([palette, np.zeros((2, 3), dtype=np.uint8)])  # -1 nothing, -2 robot: black

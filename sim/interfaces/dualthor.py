@@ -218,20 +218,20 @@ class Controller:
         world, body = self.session.world, self.session.body
         if name not in world.objects:
             raise ValueError(f"unknown object {call.get('objectID')!r} in {world.room.name}")
-        point = body.interaction_point(name)
+        point = body.objects.interaction_point(name)
         best = best_stance(
-            body.navigation(),
-            body.commanded_base(),
+            body.workspace.navigation(),
+            body.posture.stance(),
             point[:2],
-            body.comfortable_distance_m(),
+            body.workspace.comfortable_distance_m(),
             None,
             0.0,
-            body.faces_rad(name),
+            body.objects.faces_rad(name),
             body.fits,
         )
         if best is not None:
             stance = best[0]
-            within = [h for h in body.heights() if any(body.within(arm, point, h, stance) for arm in Arm)]
+            within = [h for h in body.ik.heights() if any(body.ik.within(arm, point, h, stance) for arm in Arm)]
             self.session.teleport(stance.x, stance.y, stance.yaw_rad, max(within, default=None))
             if within:
                 return self._arrived()
@@ -298,7 +298,7 @@ class Controller:
             entry["objectId"] = self._their_id(entry["objectId"])
         agent = metadata["agent"]
         name, success, message = self._last
-        points = session.body.navigation().free_positions()[::_REACHABLE_STRIDE]
+        points = session.body.workspace.navigation().free_positions()[::_REACHABLE_STRIDE]
         return {
             "id": str(self._at),
             "objects": metadata["objects"],

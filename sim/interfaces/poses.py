@@ -19,7 +19,7 @@ from data.interface.bodies import Arm
 from sim.scene.catalogue import load_catalogue
 from sim.scene.objects import ObjectPlacement
 from sim.scene.rooms import load_room
-from sim.skills.body import Body
+from sim.skills.body.body import Body
 from sim.world.placement import fits_on
 from sim.world.world import World, WorldError
 
@@ -59,18 +59,18 @@ def interactable_poses(body: Body, object_id: str, limit: int = 100) -> list[Int
         object_id: what to reach.
         limit: the most poses to return.
     """
-    point = body.interaction_point(object_id)
-    far = max(reach_map.reach_m for reach_map in body.maps.values()) + 0.1
-    navigation = body.navigation()
-    ways = navigation.ways(body.commanded_base().position)
-    heights = sorted(body.heights(), reverse=True)
+    point = body.objects.interaction_point(object_id)
+    far = max(reach_map.reach_m for reach_map in body.ik.maps.values()) + 0.1
+    navigation = body.workspace.navigation()
+    ways = navigation.ways(body.posture.stance().position)
+    heights = sorted(body.ik.heights(), reverse=True)
     found: list[InteractablePose] = []
     distances = np.arange(body.spec.footprint_radius_m, far, _RING_M)
     for stance in navigation.stances(point[:2], distances, count=_DIRECTIONS):
         if not np.isfinite(ways.costs_m(stance.position[None])[0]):
             continue
         for height in heights:
-            arms = tuple(arm.value for arm in Arm if body.within(arm, point, height, stance))
+            arms = tuple(arm.value for arm in Arm if body.ik.within(arm, point, height, stance))
             if arms:
                 found.append(InteractablePose(stance.x, stance.y, float(np.degrees(stance.yaw_rad)), height, arms))
                 break

@@ -27,7 +27,8 @@ from sim.robots.spec import load_robot
 from sim.scene.objects import Placement
 from sim.session.contingency import Contingency, load_contingency
 from sim.session.observation import observe
-from sim.skills.body import Body, ready_posture
+from sim.skills.body.body import Body
+from sim.skills.body.ready import ready_posture
 from sim.skills.failures import SkillFailure
 from sim.skills.registry import assess_action, skills_for
 from sim.skills.runner import CONTROL_DT_S, run_skills
@@ -259,13 +260,13 @@ class Session:
     def _run(self, step: PlanStep, diagnose: bool) -> Feedback:
         started = self.world.time_s
         skills = skills_for(self.body.assuming(diagnose=diagnose), step, frozenset(self.known_objects), self.draw)
-        place = self.body.base().position
+        place = self.body.base.measured().position
         path, text = 0.0, step.to_text()
 
         def advance() -> None:
             nonlocal place, path
             self.world.advance(CONTROL_DT_S)
-            now = self.body.base().position
+            now = self.body.base.measured().position
             path += float(np.linalg.norm(now - place))
             place = now
             for watch in self.watchers:
@@ -291,7 +292,7 @@ class Session:
         """The contingency of an action at the present step."""
         if self._certain:
             return "success"
-        object_id = self.body.subject(action)
+        object_id = _subject(self.body, action)
         thing = self.world.objects[object_id]
         state = {name: getattr(thing.state, name) for name in ("isFilledWithLiquid", "isToggled", "isDirty", "isBroken")}
         return self._contingency.draw(self.stats.steps, action.name, object_id, thing.type.name, state)
@@ -379,3 +380,13 @@ class Session:
         """Frees the drawing contexts of the running episode."""
         if self._opened:
             self.world.cameras.close()
+
+
+def _subject(body: Body, action: Action) -> str:
+    """Id of the object whose rule decides an action's outcome: what is put down or poured, else what the action names."""
+    held = None
+    if action.name in ("Place", "Pour", "Fill") and action.arm is not None:
+        held = body.hands.held[action.arm]
+    elif action.name == "PlaceBoth":
+        held = body.hands.lifted
+    return held or action.object_id or ""

@@ -21,7 +21,7 @@ from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.steps import Action
 from sim.scene.objects import MovingPart, ObjectInstance
-from sim.skills.body import Body, wait
+from sim.skills.body.body import Body
 from sim.skills.checks import check_open_close, check_toggle
 from sim.skills.failures import SkillFailure
 from sim.skills.lids import closed_on, led_on, plan_lead, plan_tab
@@ -32,7 +32,7 @@ from sim.skills.plan_cache import cached_plan
 from sim.skills.push import Push, plan_push, push_shut
 from sim.skills.reach import Reach, diagnosed, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import Skill
+from sim.skills.runner import Skill, wait
 
 __all__ = ["assess_open_close", "assess_toggle", "open_close", "plan_handle", "plan_press", "toggle"]
 
@@ -89,7 +89,7 @@ def carried_point(body: Body, part: MovingPart, now: Array, position: float) -> 
 
 
 def _pointings(body: Body, arm: Arm, point: Array) -> Iterator[Array]:
-    sight = point - body.shoulder(arm)
+    sight = point - body.posture.shoulder(arm)
     azimuth = float(np.arctan2(sight[1], sight[0]))
     for elevation in (-10.0, -35.0, 15.0, -60.0):
         for offset in (0.0, 30.0, -30.0, 60.0, -60.0):
@@ -113,7 +113,7 @@ def _grips(body: Body, arm: Arm, thing: ObjectInstance, handle: Array) -> Iterat
 def _bar_axis(body: Body, thing: ObjectInstance) -> Array:
     """(3,) direction along the bar of a handle."""
     model, data = body.world.model, body.world.data
-    bar = max(map(int, body.part_geoms(thing, "handle")), key=lambda geom: float(np.max(model.geom_aabb[geom, 3:])))
+    bar = max(map(int, body.objects.part_geoms(thing, "handle")), key=lambda geom: float(np.max(model.geom_aabb[geom, 3:])))
     return data.geom_xmat[bar].reshape(3, 3)[:, int(np.argmax(model.geom_aabb[bar, 3:]))].copy()
 
 
@@ -137,7 +137,7 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
     handle = body.world.data.site_xpos[part.handle_site].copy()
     low, high = part.range
     goal = low + (_OPEN_TO if opening else -0.04) * (high - low)  # shut means pushed against the stop
-    bar = tuple(map(int, body.part_geoms(thing, "handle")))
+    bar = tuple(map(int, body.objects.part_geoms(thing, "handle")))
 
     def lid(body: Body, enough: int) -> Pull:
         positions = np.linspace(float(body.world.data.qpos[part.qpos_adr]), goal, _WAYPOINTS)
@@ -194,7 +194,7 @@ def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
     handle = body.world.poses.handle(thing.object_id)
-    bar = tuple(map(int, body.part_geoms(thing, "handle")))
+    bar = tuple(map(int, body.objects.part_geoms(thing, "handle")))
 
     def search(body: Body) -> Reach:
         if thing.moving[0].spec.is_lid:
@@ -214,9 +214,9 @@ def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
 def _plan_pull(body: Body, arm: Arm, part: MovingPart, reach: Reach, hand: Array, goal: float, opening: bool) -> Pull | None:
     start = float(body.world.data.qpos[part.qpos_adr])
     positions = np.linspace(start, goal, _WAYPOINTS)
-    base = body.commanded_base()
+    base = body.posture.stance()
     ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
-    free_m = body.navigation().free_travel(base.position, base.position - 0.5 * ahead)
+    free_m = body.workspace.navigation().free_travel(base.position, base.position - 0.5 * ahead)
     span = abs(part.range[1] - part.range[0])
     best: Pull | None = None
     for back in (0.0, 0.12, 0.24, 0.36, 0.48):
@@ -226,7 +226,7 @@ def _plan_pull(body: Body, arm: Arm, part: MovingPart, reach: Reach, hand: Array
         for share, position in zip(np.linspace(0.0, 1.0, _WAYPOINTS)[1:], positions[1:], strict=True):
             x, y = base.position - back * share * ahead
             target = HandPose(carried_point(body, part, hand, float(position)))
-            solved = body.solve(arm, target, start=postures[-1], base=Stance(float(x), float(y), base.yaw_rad))
+            solved = body.ik.solve(arm, target, start=postures[-1], base=Stance(float(x), float(y), base.yaw_rad))
             if solved.error_m > 0.02 or float(np.max(np.abs(solved.q - postures[-1]))) > 0.9:
                 break
             postures.append(solved.q)
@@ -288,11 +288,11 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
     assert arm is not None and action.object_id is not None
     thing, part = body.thing(action.object_id), pull.part
     name = (thing.object_id,)
-    yield from body.move_hand(arm, pull.opening, 0.2)
-    yield from body.move_arm(arm, [*pull.reach.way, pull.reach.before])
-    yield from body.move_arm(arm, [pull.reach.at], speed=0.8)
-    yield from body.move_hand(arm, pull.closed, 0.3)
-    touched = body.part_geoms(thing, "handle")
+    yield from body.hands.move(arm, pull.opening, 0.2)
+    yield from body.arms.move(arm, [*pull.reach.way, pull.reach.before])
+    yield from body.arms.move(arm, [pull.reach.at], speed=0.8)
+    yield from body.hands.move(arm, pull.closed, 0.3)
+    touched = body.objects.part_geoms(thing, "handle")
     if action.name == "Close":  # a door or drawer can also be pushed shut at its front
         touched = np.flatnonzero(body.world.model.geom_bodyid == part.body_id)
     gap = body.probe.hand_gap_m(arm, touched)
@@ -316,20 +316,20 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
     if thing.self_closing and action.name == "Open" and _share(body, part) >= _OPEN_MIN:
         return
     body.world.grasps.detach(arm.value)
-    yield from body.move_hand(arm, 1.0, 0.2)
-    position, hand = body.hand_pose(arm)
+    yield from body.hands.move(arm, 1.0, 0.2)
+    position, hand = body.arms.hand_pose(arm)
     ways = _off_lid(body, part, body.world.poses.handle(thing.object_id)) if part.spec.is_lid else (-0.08 * hand[:, 0],)
     for way in ways:
-        away = body.solve(arm, HandPose(position + way, hand[:, 0]), start=body.commanded_arm(arm))
+        away = body.ik.solve(arm, HandPose(position + way, hand[:, 0]), start=body.arms.commanded(arm))
         if away.error_m < 0.03:
-            yield from body.move_arm(arm, [away.q])
+            yield from body.arms.move(arm, [away.q])
             break
     if part.spec.is_lid:  # home over the lid: an arm that sags on its way would push a light object
-        raised = body.vias(arm)[-1]
+        raised = body.ik.vias(arm)[-1]
         yield from wait(0.1)  # clear of the lid, the hand can touch it again
-        way = route(body, arm, body.commanded_arm(arm), raised)
+        way = route(body, arm, body.arms.commanded(arm), raised)
         if way is not None or body.probe.free(arm, [raised]):
-            yield from body.move_arm(arm, [*(way or ()), raised], speed=0.7)
+            yield from body.arms.move(arm, [*(way or ()), raised], speed=0.7)
     yield from stow(body, arm)
 
 
@@ -350,7 +350,7 @@ def _aligned(body: Body, arm: Arm, pull: Pull, tab: Array) -> Pull:
 
 def _lead(body: Body, arm: Arm, pull: Pull) -> Skill:
     """Moves hand and, where planned, base along the planned way."""
-    base = body.commanded_base()
+    base = body.posture.stance()
     ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
     length = pull.part.travel_m(float(pull.positions[-1] - pull.positions[0]))
     duration = 1.875 * max(length, 0.1) / (_LID_SPEED if pull.part.spec.is_lid else _SPEED)
@@ -361,8 +361,8 @@ def _lead(body: Body, arm: Arm, pull: Pull) -> Skill:
 
 
 def _leave(body: Body, arm: Arm, reach: Reach, ignore: tuple[str, ...]) -> Skill:
-    yield from body.move_hand(arm, 1.0, 0.2)
-    yield from body.move_arm(arm, [reach.before])
+    yield from body.hands.move(arm, 1.0, 0.2)
+    yield from body.arms.move(arm, [reach.before])
     yield from stow(body, arm, ignore)
 
 
@@ -389,7 +389,7 @@ def plan_press(body: Body, arm: Arm, point: Array, ignore: tuple[str, ...]) -> R
 
     def search(body: Body) -> Reach:
         for pointing in _pointings(body, arm, point):
-            first = body.solve(arm, HandPose(point - ahead * pointing, pointing))
+            first = body.ik.solve(arm, HandPose(point - ahead * pointing, pointing))
             if not fulfils(first, pointing=0.8):
                 continue
             # the fingertip, as the hand will really be turned, belongs on the switch
@@ -413,16 +413,16 @@ def toggle(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     arm = action.arm
     assert arm is not None and action.object_id is not None
     thing = body.thing(action.object_id)
-    yield from body.move_hand(arm, body.spec.hand.press[2], 0.2)
-    yield from body.move_arm(arm, [*reach.way, reach.before])
-    yield from body.touch(arm, reach.at, body.part_geoms(thing, "toggle"), speed=0.7)
+    yield from body.hands.move(arm, body.spec.hand.press[2], 0.2)
+    yield from body.arms.move(arm, [*reach.way, reach.before])
+    yield from body.arms.touch(arm, reach.at, body.objects.part_geoms(thing, "toggle"), speed=0.7)
     yield from wait(0.1)
-    gap = body.probe.hand_gap_m(arm, body.part_geoms(thing, "toggle"))
+    gap = body.probe.hand_gap_m(arm, body.objects.part_geoms(thing, "toggle"))
     outcome = outcome_draw(action)
     if gap <= GRASP_GAP_M and outcome == "success":
         body.world.states.set_state(thing.object_id, "isToggled", action.name == "ToggleOn")
-    yield from body.move_arm(arm, [reach.before])
-    yield from body.move_hand(arm, 1.0, 0.2)
+    yield from body.arms.move(arm, [reach.before])
+    yield from body.hands.move(arm, 1.0, 0.2)
     yield from stow(body, arm)
     if gap > GRASP_GAP_M:
         raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": gap})

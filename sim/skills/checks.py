@@ -9,7 +9,7 @@ from __future__ import annotations
 from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from sim.scene.objects import ObjectInstance
-from sim.skills.body import Body
+from sim.skills.body.body import Body
 from sim.skills.failures import SkillFailure
 
 __all__ = [
@@ -36,9 +36,9 @@ def _check_accessible(body: Body, thing: ObjectInstance) -> None:
 
 
 def _check_free_hand(body: Body, arm: Arm) -> None:
-    if body.lifted is not None:
+    if body.hands.lifted is not None:
         raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
-    if body.held[arm] is not None:
+    if body.hands.held[arm] is not None:
         raise SkillFailure(FailureCode.HAND_OCCUPIED)
 
 
@@ -64,9 +64,9 @@ def check_pick(body: Body, arm: Arm, thing: ObjectInstance) -> None:
 
 def check_place(body: Body, arm: Arm, receptacle: ObjectInstance) -> ObjectInstance:
     """Preconditions of Place; returns what the hand holds."""
-    if body.lifted is not None:
+    if body.hands.lifted is not None:
         raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
-    name = body.held[arm]
+    name = body.hands.held[arm]
     if name is None:
         raise SkillFailure(FailureCode.HAND_EMPTY)
     _check_receptacle(body, receptacle, name)
@@ -109,9 +109,9 @@ def check_toggle(body: Body, arm: Arm, thing: ObjectInstance, on: bool) -> None:
 
 def _held(body: Body, arm: Arm) -> ObjectInstance:
     """What an arm alone holds and can use."""
-    if body.lifted is not None:
+    if body.hands.lifted is not None:
         raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
-    name = body.held[arm]
+    name = body.hands.held[arm]
     if name is None:
         raise SkillFailure(FailureCode.HAND_EMPTY)
     return body.thing(name)
@@ -217,9 +217,9 @@ def check_fill(body: Body, arm: Arm, source: ObjectInstance) -> tuple[ObjectInst
 
 def check_lift(body: Body, thing: ObjectInstance) -> None:
     """Preconditions of Lift."""
-    if body.lifted is not None:
+    if body.hands.lifted is not None:
         raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
-    if any(name is not None for name in body.held.values()):
+    if any(name is not None for name in body.hands.held.values()):
         raise SkillFailure(FailureCode.HAND_OCCUPIED)
     if not thing.movable:
         raise SkillFailure(FailureCode.NOT_LIFTABLE)
@@ -233,7 +233,7 @@ def check_lift(body: Body, thing: ObjectInstance) -> None:
 
 def check_place_both(body: Body, receptacle: ObjectInstance) -> ObjectInstance:
     """Preconditions of PlaceBoth; returns what both hands hold."""
-    name = body.lifted
+    name = body.hands.lifted
     if name is None:
         raise SkillFailure(FailureCode.HAND_EMPTY)
     _check_receptacle(body, receptacle, name)

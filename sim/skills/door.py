@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.scene.objects import MovingPart, ObjectInstance
-from sim.skills.body import Body
-from sim.skills.clearance import AtDoor
+from sim.skills.body.body import Body
+from sim.skills.body.clearance import AtDoor
 
 __all__ = ["Door"]
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from data.interface.bodies import Arm
 from sim.robots.spec import HandSpec
 from sim.scene.objects import ObjectInstance
-from sim.skills.body import Body
+from sim.skills.body.body import Body
 from sim.skills.reach_map import HandPose
 
 __all__ = ["Grasp", "grasp_candidates", "solid_box"]
@@ -113,7 +113,7 @@ def grasp_candidates(body: Body, arm: Arm, thing: ObjectInstance) -> Iterator[Gr
     """Grasps of an object, most promising first; whether the arm can do them is for the caller to find out."""
     hand = body.spec.hand
     shape = _shape(body, thing)
-    shoulder = body.shoulder(arm)
+    shoulder = body.posture.shoulder(arm)
     yield from _wraps(thing, shape, hand, shoulder)
     yield from _rims(thing, shape, hand, shoulder)
     yield from _tops(shape, hand, shoulder)

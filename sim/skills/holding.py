@@ -10,7 +10,7 @@ from __future__ import annotations
 from data.interface.failures import FailureCode
 from data.interface.steps import Action
 from sim.skills.articulate import plan_handle
-from sim.skills.body import Body, wait
+from sim.skills.body.body import Body
 from sim.skills.checks import check_hold
 from sim.skills.failures import SkillFailure
 from sim.skills.grasps import Grasp
@@ -18,7 +18,7 @@ from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, grip, plan_pick, ret
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.skills.runner import CONTROL_DT_S, Skill, wait
 
 __all__ = ["assess_hold", "hold", "release"]
 
@@ -48,14 +48,14 @@ def hold(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     thing = body.thing(action.object_id)
     name = (thing.object_id,)
     if grasp is not None:
-        yield from grip(body, arm, grasp, reach, body.solid_geoms(thing))
-        gap = max(body.probe.finger_gaps_m(arm, body.solid_geoms(thing)))
+        yield from grip(body, arm, grasp, reach, body.objects.solid_geoms(thing))
+        gap = max(body.probe.finger_gaps_m(arm, body.objects.solid_geoms(thing)))
     else:
-        yield from body.move_hand(arm, 1.0, 0.2)
-        yield from body.move_arm(arm, [*reach.way, reach.before])
-        yield from body.move_arm(arm, [reach.at], speed=0.8)
-        yield from body.move_hand(arm, 0.35, 0.3)
-        gap = body.probe.hand_gap_m(arm, body.part_geoms(thing, "handle"))
+        yield from body.hands.move(arm, 1.0, 0.2)
+        yield from body.arms.move(arm, [*reach.way, reach.before])
+        yield from body.arms.move(arm, [reach.at], speed=0.8)
+        yield from body.hands.move(arm, 0.35, 0.3)
+        gap = body.probe.hand_gap_m(arm, body.objects.part_geoms(thing, "handle"))
     outcome = outcome_draw(action)
     if gap > GRASP_GAP_M or thing.held_by or outcome != "success":
         taken = bool(thing.held_by)
@@ -77,16 +77,16 @@ def release(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     del outcome_draw
     arm = action.arm
     assert arm is not None
-    name = body.held[arm] if body.lifted is None else body.lifted
+    name = body.hands.held[arm] if body.hands.lifted is None else body.hands.lifted
     if name is None:
         raise SkillFailure(FailureCode.HAND_EMPTY)
     thing = body.thing(name)
     body.world.grasps.detach(arm.value)
-    yield from body.move_hand(arm, 1.0)
-    position, hand = body.hand_pose(arm)
-    back = body.solve(arm, HandPose(position - 0.08 * hand[:, 0], hand[:, 0], hand[:, 1]), start=body.commanded_arm(arm))
+    yield from body.hands.move(arm, 1.0)
+    position, hand = body.arms.hand_pose(arm)
+    back = body.ik.solve(arm, HandPose(position - 0.08 * hand[:, 0], hand[:, 0], hand[:, 1]), start=body.arms.commanded(arm))
     if back.error_m < 0.03:
-        yield from body.move_arm(arm, [back.q])
+        yield from body.arms.move(arm, [back.q])
     yield from stow(body, arm, (name,))
     yield from wait(0.1)
     for _ in range(int((3.0 if thing.self_closing else 1.0) / CONTROL_DT_S)):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.interface.bodies import Arm
-from sim.skills.body import Body
+from sim.skills.body.body import Body
 from sim.skills.navigation import Stance
 from sim.skills.reach import Reach, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
@@ -117,7 +117,7 @@ def _takings(body: Body, arm: Arm, tab: Array, pointings: Iterable[Array], bar: 
     how = _tab(body)
     for pointing in pointings:
         for closing in _closings(body, pointing):
-            first = body.solve(arm, HandPose(_site(tab, how.seat, pointing, closing), pointing, closing))
+            first = body.ik.solve(arm, HandPose(_site(tab, how.seat, pointing, closing), pointing, closing))
             if not fulfils(first, pointing=0.7, closing=0.5):
                 continue
             # the tab belongs between the fingertips of the hand as it will really be turned
@@ -187,8 +187,8 @@ def led_on(body: Body, arm: Arm, arc: Callable[[float], Array], positions: Array
         (M, A) arm joints, M at most N: the arm may end before the way does.
     """
     tab = arc(float(positions[0]))
-    q = body.commanded_arm(arm)
-    site, hand = body.hand_pose_at(arm, q)
+    q = body.arms.commanded(arm)
+    site, hand = body.ik.hand_pose_at(arm, q)
     x, y, z = hand.T @ (tab - site)
     points = [arc(float(p)) for p in positions]
     held = _Held(q, hand[:, 0], hand[:, 1], (float(x), float(y), float(z)))
@@ -197,23 +197,23 @@ def led_on(body: Body, arm: Arm, arc: Callable[[float], Array], positions: Array
 
 def _backs(body: Body, arm: Arm, point: Array, share: float) -> list[float]:
     """How far the base may step back on the way, so that a point of it at that share can be in reach at all."""
-    base = body.commanded_base()
+    base = body.posture.stance()
     ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
-    free_m = body.navigation().free_travel(base.position, base.position - 0.3 * ahead)
+    free_m = body.workspace.navigation().free_travel(base.position, base.position - 0.3 * ahead)
     found: list[float] = []
     for back in (0.0, 0.12, 0.24):
         x, y = base.position - share * back * ahead
-        shoulder = body.shoulder(arm) - share * back * np.append(ahead, 0.0)
+        shoulder = body.posture.shoulder(arm) - share * back * np.append(ahead, 0.0)
         site = point + _tab(body).seat[0] * (shoulder - point) / float(np.linalg.norm(shoulder - point))
         stance = Stance(float(x), float(y), base.yaw_rad)
-        if back <= free_m and body.maps[arm.value].gap_m(body.in_trunk(site, None, stance)) <= _NEAR_M:
+        if back <= free_m and body.ik.maps[arm.value].gap_m(body.posture.in_trunk(site, None, stance)) <= _NEAR_M:
             found.append(back)
     return found
 
 
 def _stances(body: Body, back_m: float, count: int) -> list[Stance]:
     """The base's ways back, evenly."""
-    base = body.commanded_base()
+    base = body.posture.stance()
     ahead = np.array([np.cos(base.yaw_rad), np.sin(base.yaw_rad)])
     places = [base.position - share * back_m * ahead for share in np.linspace(0.0, 1.0, count)]
     return [Stance(float(x), float(y), base.yaw_rad) for x, y in places]
@@ -227,8 +227,8 @@ def _follow(body: Body, arm: Arm, points: Sequence[Array], stances: Sequence[Sta
         missed, gap_m = np.zeros(3), np.inf
         for _ in range(_ROUNDS):
             wish = HandPose(_site(point, held.seat, pointing, closing) - missed, pointing, closing)
-            goal = body.solve(arm, wish, start=start, base=stance, pointing_weight=0.05, roll_weight=0.02)
-            site, hand = body.hand_pose_at(arm, goal.q, stance)
+            goal = body.ik.solve(arm, wish, start=start, base=stance, pointing_weight=0.05, roll_weight=0.02)
+            site, hand = body.ik.hand_pose_at(arm, goal.q, stance)
             off = site + hand @ held.seat - point
             gap_m, start, pointing, closing = float(np.linalg.norm(off)), goal.q, hand[:, 0], hand[:, 1]
             if gap_m <= _EXACT_M or gap_m > _LOST_M:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.steps import Action
-from sim.skills.body import Body
+from sim.skills.body.body import Body
 from sim.skills.failures import SkillFailure
 from sim.skills.navigation import NavigationMap, Stance, wrap_angle
 from sim.skills.runner import CONTROL_DT_S, Skill
@@ -54,12 +54,12 @@ _WORSE: Final = 0.8
 
 
 def _turn(body: Body, yaw_rad: float) -> Skill:
-    start = body.commanded_base()
+    start = body.posture.stance()
     yield from _turn_by(body, wrap_angle(yaw_rad - start.yaw_rad))
 
 
 def _turn_by(body: Body, change_rad: float) -> Skill:
-    start = body.commanded_base()
+    start = body.posture.stance()
     ways = plan(np.array([[0.0], [change_rad]]), TURN_SPEED_RAD_S, TURN_ACCELERATION_RAD_S2)
     turns = [float(ways.at(time_s)[0]) for time_s in _ticks(ways.duration_s)]
     yield from _travel(body, np.array([(start.x, start.y, start.yaw_rad + turn) for turn in turns]))
@@ -68,7 +68,7 @@ def _turn_by(body: Body, change_rad: float) -> Skill:
 def _walk(body: Body, path: NDArray[np.float64], along: bool, limits: NDArray[np.float64] = _PUSHED) -> Skill:
     """Follows a polyline; `along` turns the heading into the way as it goes, at a bounded rate."""
     way = plan_polyline(path, WALK_SPEED_M_S, WALK_ACCELERATION_M_S2)
-    yaw = body.commanded_base().yaw_rad
+    yaw = body.posture.stance().yaw_rad
     poses = []
     for time_s in _ticks(way.duration_s):
         x, y = way.at(time_s)
@@ -99,17 +99,17 @@ def _travel(body: Body, way: NDArray[np.float64], limits: NDArray[np.float64] = 
     """
     if len(way) == 0:
         return
-    start = body.commanded_base()
+    start = body.posture.stance()
     way = np.concatenate([[(start.x, start.y, start.yaw_rad)], way])  # (T + 1, 3)
-    bases, legs = body.walking_targets(way)
-    limits = np.maximum(limits, body.pushed() + 0.5 * _PUSHED)
+    bases, legs = body.base.walking_targets(way)
+    limits = np.maximum(limits, body.contacts.pushed() + 0.5 * _PUSHED)
     for tick in range(1, len(way)):
-        body.command_base(*map(float, bases[tick]))
-        body.command_legs(legs[tick])
+        body.base.command(*map(float, bases[tick]))
+        body.base.command_legs(legs[tick])
         yield
-        if np.any(body.pushed() > limits):
+        if np.any(body.contacts.pushed() > limits):
             yield from _retreat(body, way[: tick + 1], legs)
-            walked = float(np.linalg.norm(body.commanded_base().position - start.position))
+            walked = float(np.linalg.norm(body.posture.stance().position - start.position))
             raise SkillFailure(FailureCode.BLOCKED_PATH, {"travel_m": walked})
 
 
@@ -117,12 +117,12 @@ def _retreat(body: Body, way: NDArray[np.float64], legs: NDArray[np.float64]) ->
     """Goes back along a way until nothing presses, a third of a second at most, and brings the feet together."""
 
     def command(tick: int) -> None:
-        body.command_base(*map(float, way[tick]))
-        body.command_legs(legs[tick])
+        body.base.command(*map(float, way[tick]))
+        body.base.command_legs(legs[tick])
 
     tick = yield from _go_back(body, len(way) - 1, command)
     for share in np.linspace(0.0, 1.0, round(0.3 / CONTROL_DT_S))[1:]:
-        body.command_legs((1.0 - share) * legs[tick] + share * legs[0])
+        body.base.command_legs((1.0 - share) * legs[tick] + share * legs[0])
         yield
 
 
@@ -132,7 +132,7 @@ def _go_back(body: Body, tick: int, command: Callable[[int], None]) -> Generator
         tick = earlier
         command(tick)
         yield
-        if np.all(body.pushed() <= 0.5 * _PUSHED):
+        if np.all(body.contacts.pushed() <= 0.5 * _PUSHED):
             break
     return tick
 
@@ -140,7 +140,7 @@ def _go_back(body: Body, tick: int, command: Callable[[int], None]) -> Generator
 def _settle(body: Body) -> Skill:
     """Waits until the base has come to rest at its target, at most half a second."""
     for _ in range(int(0.5 / CONTROL_DT_S)):
-        if body.base_error_m() < 0.004:
+        if body.base.error_m() < 0.004:
             return
         yield
 
@@ -153,7 +153,7 @@ def _length_m(path: NDArray[np.float64]) -> float:
 def _before(body: Body, start: Stance, stance: Stance) -> NDArray[np.float64] | None:
     """A polyline (N, 2) to a place from which a straight step ahead leads to a stance, None when there is none."""
     ahead = np.array([np.cos(stance.yaw_rad), np.sin(stance.yaw_rad)])
-    navigation = body.navigation()
+    navigation = body.workspace.navigation()
     for distance in _LAST_STEP_M:
         place = stance.position - distance * ahead
         if navigation.is_free(place) and navigation.segment_free(place, stance.position):
@@ -192,13 +192,13 @@ def sweep(body: Body, arm: Arm, postures: NDArray[np.float64], stances: NDArray[
         return np.column_stack([np.interp(travelled, shares, column) for column in rows.T])  # (N, D) -> (T, D)
 
     arms = between(postures)
-    walking = body.walking_targets(between(stances)) if bool(np.any(np.ptp(stances, axis=0) > 1e-6)) else None
+    walking = body.base.walking_targets(between(stances)) if bool(np.any(np.ptp(stances, axis=0) > 1e-6)) else None
     for k in range(1, steps + 1):
-        body.command_arm(arm, arms[k])
+        body.arms.command(arm, arms[k])
         if walking is not None:
             bases, legs = walking
-            body.command_base(*map(float, bases[k]))
-            body.command_legs(legs[k])
+            body.base.command(*map(float, bases[k]))
+            body.base.command_legs(legs[k])
         yield
 
 
@@ -209,10 +209,10 @@ def move(body: Body, action: Action) -> Skill:
         SkillFailure: BlockedPath with the metres that were walked.
     """
     amount = action.amount if action.amount is not None else float(action.spec.amount_default or 0.0)
-    start = body.commanded_base()
+    start = body.posture.stance()
     angle = start.yaw_rad + _DIRECTIONS[action.name]
     goal = start.position + amount * np.array([np.cos(angle), np.sin(angle)])
-    free_m = body.navigation().free_travel(start.position, goal)
+    free_m = body.workspace.navigation().free_travel(start.position, goal)
     blocked = free_m < amount - 0.01
     if free_m > 0.01:
         end = start.position + (goal - start.position) * (free_m / amount)
@@ -241,19 +241,19 @@ def change_height(body: Body, action: Action) -> Skill:
         SkillFailure: HeightLimit, with the part of the change that was not made, when they could do less than asked.
     """
     amount = action.amount if action.amount is not None else float(action.spec.amount_default or 0.0)
-    start = body.pelvis_height_m
+    start = body.posture.pelvis_height_m
     wanted = start + (amount if action.name == "MoveUp" else -amount)
     low, high = body.spec.pelvis_height_range_m
     goal = float(np.clip(wanted, low, high))
     way = plan(np.array([[start], [goal]]), HEIGHT_SPEED_M_S, HEIGHT_ACCELERATION_M_S2)
-    limits = np.maximum(_PUSHED, body.pushed() + 0.5 * _PUSHED)
+    limits = np.maximum(_PUSHED, body.contacts.pushed() + 0.5 * _PUSHED)
     heights = [float(way.at(time_s)[0]) for time_s in _ticks(way.duration_s)]
     for tick, height_m in enumerate(heights):
-        body.command_height(height_m)
+        body.base.command_height(height_m)
         yield
-        if np.any(body.pushed() > limits):
-            yield from _go_back(body, tick, lambda earlier: body.command_height(heights[earlier]))
-            goal = body.pelvis_height_m
+        if np.any(body.contacts.pushed() > limits):
+            yield from _go_back(body, tick, lambda earlier: body.base.command_height(heights[earlier]))
+            goal = body.posture.pelvis_height_m
             break
     yield from _settle(body)
     if abs(wanted - goal) > 0.005:
@@ -326,17 +326,17 @@ def go_to(body: Body, action: Action) -> Skill:
         SkillFailure: NoFreePose, or BlockedPath when a hand runs into something on the way.
     """
     assert action.object_id is not None
-    target = body.interaction_point(action.object_id)[:2]
+    target = body.objects.interaction_point(action.object_id)[:2]
     bearing = np.deg2rad(action.bearing_deg) if action.bearing_deg is not None else 0.0
-    start = body.commanded_base()
+    start = body.posture.stance()
     found = best_stance(
-        body.navigation(),
+        body.workspace.navigation(),
         start,
         target,
-        body.comfortable_distance_m(),
+        body.workspace.comfortable_distance_m(),
         action.amount,
         bearing,
-        body.faces_rad(action.object_id),
+        body.objects.faces_rad(action.object_id),
         body.fits,
     )
     if found is None:

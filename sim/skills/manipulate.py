@@ -19,14 +19,15 @@ from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
-from sim.skills.body import Body, wait
+from sim.skills.body.body import Body
+from sim.skills.body.ready import carrying_posture, ready_posture
 from sim.skills.checks import check_pick, check_place
 from sim.skills.failures import SkillFailure
 from sim.skills.grasps import Grasp, grasp_candidates
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach, diagnose, diagnosed, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.skills.runner import CONTROL_DT_S, Skill, wait
 
 __all__ = [
     "OutcomeDraw",
@@ -88,12 +89,12 @@ def _find_grasp(
         wish = grasp.hand()
         if avoid is not None and avoid.family == grasp.family and float(avoid.pointing @ grasp.pointing) > 0.95:
             continue
-        if not body.within(arm, wish.position, body.pelvis_height_m):
+        if not body.ik.within(arm, wish.position, body.posture.pelvis_height_m):
             continue
         tried += 1
         if tried > limit:
             return None
-        first = body.solve(arm, wish)
+        first = body.ik.solve(arm, wish)
         if not fulfils(first):
             continue
         # the arm points where it can: seat the object in the hand as it will really be turned
@@ -109,14 +110,14 @@ def _find_grasp(
 
 def stow(body: Body, arm: Arm, ignore: tuple[str | int, ...] = ()) -> Skill:
     """Brings the arm to its ready posture, or to the carrying one with something in the hand, around what is in the way."""
-    held = body.held[arm]
-    goal = body.ready(arm) if held is None or not body.thing(held).movable else _carry(body, arm, held)
+    held = body.hands.held[arm]
+    goal = ready_posture(body.kit, arm) if held is None or not body.thing(held).movable else _carry(body, arm, held)
     if held is not None and body.thing(held).state.fillLitres > 0.0:
-        yield from body.move_arm(arm, [*_level_way(body, arm, held, goal), goal], speed=_CARE)
+        yield from body.arms.move(arm, [*_level_way(body, arm, held, goal), goal], speed=_CARE)
         return
-    way = route(body, arm, body.commanded_arm(arm), goal, ignore)
-    vias = way if way is not None else tuple(body.vias(arm))[:1]
-    yield from body.move_arm(arm, [*vias, goal])
+    way = route(body, arm, body.arms.commanded(arm), goal, ignore)
+    vias = way if way is not None else tuple(body.ik.vias(arm))[:1]
+    yield from body.arms.move(arm, [*vias, goal])
 
 
 def _carry(body: Body, arm: Arm, held: str) -> Array:
@@ -124,16 +125,16 @@ def _carry(body: Body, arm: Arm, held: str) -> Array:
 
     What holds a liquid is carried where the arm holds it upright, which may be farther ahead.
     """
-    usual = body.carrying(arm)
-    _, hand = body.hand_pose(arm)
+    usual = carrying_posture(body.kit, arm)
+    _, hand = body.arms.hand_pose(arm)
     turn = upright(body.world.poses.pose(held)[:3, :3])
     pointing, closing = turn @ hand[:, 0], turn @ hand[:, 1]
-    ahead = body.turn_to_world(np.array([1.0, 0.0, 0.0]))
+    ahead = body.posture.turn_to_world(np.array([1.0, 0.0, 0.0]))
     if np.hypot(*pointing[:2]) > 0.15:
         about = _turn_z(float(np.arctan2(ahead[1], ahead[0]) - np.arctan2(pointing[1], pointing[0])))
         pointing, closing = about @ pointing, about @ closing
-    place_at = body.hand_at(arm, usual)
-    solved = body.solve(arm, HandPose(place_at, pointing, closing), start=usual, roll_weight=0.2)
+    place_at = body.ik.hand_at(arm, usual)
+    solved = body.ik.solve(arm, HandPose(place_at, pointing, closing), start=usual, roll_weight=0.2)
     if body.thing(held).state.fillLitres > 0.0:
         up = hand.T @ body.world.poses.pose(held)[:3, 2]
         return _level(body, arm, up, place_at, pointing, closing, solved.q if solved.error_m < 0.05 else usual)
@@ -142,14 +143,14 @@ def _carry(body: Body, arm: Arm, held: str) -> Array:
 
 def _level_way(body: Body, arm: Arm, held: str, goal: Array) -> list[Array]:
     """(A,) postures on the hand's straight way to carrying on which a vessel stays upright, as far as they exist."""
-    start, end = body.hand_pose(arm)[0], body.hand_at(arm, goal)
-    hand = body.hand_pose(arm)[1]
+    start, end = body.arms.hand_pose(arm)[0], body.ik.hand_at(arm, goal)
+    hand = body.arms.hand_pose(arm)[1]
     turn = upright(body.world.poses.pose(held)[:3, :3])
     pointing, closing = turn @ hand[:, 0], turn @ hand[:, 1]
     way: list[Array] = []
-    last = body.commanded_arm(arm)
+    last = body.arms.commanded(arm)
     for share in (0.25, 0.5, 0.75):
-        solved = body.solve(arm, HandPose(start + share * (end - start), pointing, closing), start=last, roll_weight=0.2)
+        solved = body.ik.solve(arm, HandPose(start + share * (end - start), pointing, closing), start=last, roll_weight=0.2)
         if solved.error_m < 0.05 and body.probe.free(arm, [solved.q]):
             last = solved.q
             way.append(last)
@@ -162,22 +163,22 @@ _NUDGE_RAD: Final = 0.6
 
 def nudge(body: Body, arm: Arm, change: Array) -> Skill:
     """Moves the hand by a small way in the world, as far as the arm can."""
-    position, hand = body.hand_pose(arm)
-    goal = body.solve(arm, HandPose(position + change, hand[:, 0], hand[:, 1]), start=body.commanded_arm(arm))
-    if goal.error_m < 0.03 and float(np.max(np.abs(goal.q - body.commanded_arm(arm)))) < _NUDGE_RAD:
-        yield from body.move_arm(arm, [goal.q], speed=0.6)
+    position, hand = body.arms.hand_pose(arm)
+    goal = body.ik.solve(arm, HandPose(position + change, hand[:, 0], hand[:, 1]), start=body.arms.commanded(arm))
+    if goal.error_m < 0.03 and float(np.max(np.abs(goal.q - body.arms.commanded(arm)))) < _NUDGE_RAD:
+        yield from body.arms.move(arm, [goal.q], speed=0.6)
 
 
 def _level(body: Body, arm: Arm, up: Array, near: Array, pointing: Array, closing: Array, otherwise: Array) -> Array:
     """(A,) posture around a point in which an object whose axis is `up` in the hand stands upright, or most nearly so."""
     best: tuple[float, Array] | None = None
-    ahead, left = body.turn_to_world(np.array([1.0, 0.0, 0.0])), body.turn_to_world(np.array([0.0, 1.0, 0.0]))
+    ahead, left = body.posture.turn_to_world(np.array([1.0, 0.0, 0.0])), body.posture.turn_to_world(np.array([0.0, 1.0, 0.0]))
     outward = left if arm is Arm.LEFT else -left
     for forward in (0.0, 0.08, 0.16):
         for rise in (0.0, -0.1, 0.1, -0.2):
             for aside in (0.0, 0.08):
                 point = near + forward * ahead + aside * outward + rise * _UP
-                goal = body.solve(arm, HandPose(point, pointing, closing), roll_weight=0.2)
+                goal = body.ik.solve(arm, HandPose(point, pointing, closing), roll_weight=0.2)
                 axes = np.stack([goal.pointing, goal.closing, np.cross(goal.pointing, goal.closing)], axis=1)
                 tilt = float(np.arccos(np.clip((axes @ up)[2], -1.0, 1.0)))
                 if goal.error_m > 0.05 or not body.probe.free(arm, [goal.q]):
@@ -192,9 +193,9 @@ def _level(body: Body, arm: Arm, up: Array, near: Array, pointing: Array, closin
 def _close(body: Body, arm: Arm, geoms: NDArray[np.int64]) -> Skill:
     """Closes the hand until both finger groups touch, or it is closed."""
     steps = 28
-    start = body.hand_opening(arm)
+    start = body.hands.opening(arm)
     for k in range(1, steps + 1):
-        body.command_hand(arm, start * (1.0 - k / steps))
+        body.hands.command(arm, start * (1.0 - k / steps))
         yield
         if k % 2 == 0 and max(body.probe.finger_gaps_m(arm, geoms)) <= 0.002:
             return
@@ -203,8 +204,8 @@ def _close(body: Body, arm: Arm, geoms: NDArray[np.int64]) -> Skill:
 
 def retreat(body: Body, arm: Arm, reach: Reach, ignore: tuple[str | int, ...]) -> Skill:
     """Opens the hand, backs off along the approach and stows the arm."""
-    yield from body.move_hand(arm, 1.0)
-    yield from body.move_arm(arm, [reach.before])
+    yield from body.hands.move(arm, 1.0)
+    yield from body.arms.move(arm, [reach.before])
     yield from stow(body, arm, ignore)
 
 
@@ -219,12 +220,12 @@ def pick(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     assert arm is not None and action.object_id is not None
     thing = body.thing(action.object_id)
     name = (thing.object_id,)
-    geoms = body.solid_geoms(thing)
+    geoms = body.objects.solid_geoms(thing)
     yield from grip(body, arm, grasp, reach, geoms)
     gaps = body.probe.finger_gaps_m(arm, geoms)
     if max(gaps) > GRASP_GAP_M:  # look again and try another way once
-        yield from body.move_hand(arm, 1.0, 0.2)
-        yield from body.move_arm(arm, [reach.before])
+        yield from body.hands.move(arm, 1.0, 0.2)
+        yield from body.arms.move(arm, [reach.before])
         again = _find_grasp(body, arm, thing, _MAX_PLANS, avoid=grasp)
         if again is not None:
             grasp, reach = again
@@ -242,15 +243,15 @@ def pick(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     if outcome != "success":
         yield from _bad_luck(body, arm, thing, outcome)
     yield from stow(body, arm, name)
-    if body.held[arm] != thing.object_id:
+    if body.hands.held[arm] != thing.object_id:
         raise SkillFailure(FailureCode.DROPPED)
 
 
 def grip(body: Body, arm: Arm, grasp: Grasp, reach: Reach, geoms: NDArray[np.int64]) -> Skill:
     """Moves the open hand to the object and closes it."""
-    yield from body.move_hand(arm, grasp.opening, 0.2)
-    yield from body.move_arm(arm, [*reach.way, reach.before])
-    yield from body.move_arm(arm, [reach.at], speed=0.8)
+    yield from body.hands.move(arm, grasp.opening, 0.2)
+    yield from body.arms.move(arm, [*reach.way, reach.before])
+    yield from body.arms.move(arm, [reach.at], speed=0.8)
     yield from wait(0.06)
     if grasp.opening > 0.9:
         yield from _close(body, arm, geoms)
@@ -258,11 +259,11 @@ def grip(body: Body, arm: Arm, grasp: Grasp, reach: Reach, geoms: NDArray[np.int
 
 def _lift(body: Body, arm: Arm) -> Skill:
     """Raises the held object straight up."""
-    position, hand = body.hand_pose(arm)
-    current = body.commanded_arm(arm)
-    up = body.solve(arm, HandPose(position + _LIFT_M * _UP, hand[:, 0], hand[:, 1]), start=current)
+    position, hand = body.arms.hand_pose(arm)
+    current = body.arms.commanded(arm)
+    up = body.ik.solve(arm, HandPose(position + _LIFT_M * _UP, hand[:, 0], hand[:, 1]), start=current)
     if up.error_m < 0.03:
-        yield from body.move_arm(arm, [up.q])
+        yield from body.arms.move(arm, [up.q])
 
 
 def _bad_luck(body: Body, arm: Arm, thing: ObjectInstance, outcome: str) -> Skill:
@@ -274,7 +275,7 @@ def _bad_luck(body: Body, arm: Arm, thing: ObjectInstance, outcome: str) -> Skil
         body.world.liquids.spill(thing)
     if outcome == "broken" and thing.type.has("breakable"):
         body.world.states.set_state(thing.object_id, "isBroken", True)
-    yield from body.move_hand(arm, 1.0)
+    yield from body.hands.move(arm, 1.0)
     yield from wait(0.3)
     yield from stow(body, arm, (thing.object_id,))
     raise SkillFailure(code, contingency=outcome)
@@ -289,7 +290,7 @@ def plan_place(body: Body, arm: Arm, thing: ObjectInstance, receptacle: ObjectIn
     Raises:
         SkillFailure: ReceptacleFull, TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
-    spots = body.free_spots(thing, receptacle, arm)
+    spots = body.workspace.free_spots(thing, receptacle, arm)
     if not spots:
         raise SkillFailure(FailureCode.RECEPTACLE_FULL)
     over_m = max(_APPROACH_PLACE_M, _rim_m(body, receptacle) - float(spots[0][2]) + _OVER_RIM_M)
@@ -336,7 +337,7 @@ def plan_bring(
     Raises:
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
-    position, hand = body.hand_pose(arm)
+    position, hand = body.arms.hand_pose(arm)
     pose = body.world.poses.pose(thing.object_id)
     # the object upright again, turned about the vertical only
     tilt = upright(pose[:3, :3])
@@ -346,7 +347,7 @@ def plan_bring(
     lowest = _lowest(thing, tilt @ pose[:3, :3])
     if point is not None:
         lowest -= float((tilt @ pose[:3, :3] @ point)[2])
-    shoulder = body.shoulder(arm)
+    shoulder = body.posture.shoulder(arm)
     lift = np.array([0.0, 0.0, above_m - lowest])
 
     def search(body: Body) -> tuple[Array, Reach, Array]:
@@ -375,28 +376,28 @@ def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     _, reach, away = assess_place(body, action)
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    receptacle, thing = body.thing(action.object_id), body.thing(body.held[arm] or "")
+    receptacle, thing = body.thing(action.object_id), body.thing(body.hands.held[arm] or "")
     outcome = outcome_draw(action)
     name = (thing.object_id,)
-    yield from body.move_arm(arm, [*reach.way, reach.before])
+    yield from body.arms.move(arm, [*reach.way, reach.before])
     if outcome in ("nothing", "spilled"):
         if outcome == "spilled":
             body.world.liquids.spill(thing)
         yield from stow(body, arm, name)
         raise SkillFailure(FailureCode.SPILLED if outcome == "spilled" else FailureCode.NOTHING_HAPPENED, contingency=outcome)
-    lowering = body.move_arm(arm, [reach.at], speed=0.6)
+    lowering = body.arms.move(arm, [reach.at], speed=0.6)
     for _ in lowering:
         yield
-        if body.rests(thing):
+        if body.contacts.rests(thing):
             break
     yield from wait(0.04)
     if outcome == "broken" and thing.type.has("breakable"):
         body.world.states.set_state(thing.object_id, "isBroken", True)
     body.world.grasps.detach(arm.value)
-    yield from body.move_hand(arm, 1.0)
-    position, hand = body.hand_pose(arm)
-    back = body.solve(arm, HandPose(position + 0.09 * away, hand[:, 0], hand[:, 1]), start=body.commanded_arm(arm))
-    yield from body.move_arm(arm, [back.q if back.error_m < 0.03 else reach.before])
+    yield from body.hands.move(arm, 1.0)
+    position, hand = body.arms.hand_pose(arm)
+    back = body.ik.solve(arm, HandPose(position + 0.09 * away, hand[:, 0], hand[:, 1]), start=body.arms.commanded(arm))
+    yield from body.arms.move(arm, [back.q if back.error_m < 0.03 else reach.before])
     yield from stow(body, arm)
     for _ in range(int(1.0 / CONTROL_DT_S)):
         if body.world.poses.speed_m_s(thing.object_id) < 0.02:
@@ -405,7 +406,7 @@ def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     if outcome == "broken":
         raise SkillFailure(FailureCode.BROKE, contingency=outcome)
     if receptacle.object_id not in body.world.containment.parents(thing.object_id):
-        gap = float(np.linalg.norm(body.world_position(thing.object_id) - body.world_position(receptacle.object_id)))
+        gap = float(np.linalg.norm(body.objects.center(thing.object_id) - body.objects.center(receptacle.object_id)))
         raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})
 
 
@@ -442,12 +443,12 @@ def reset_arm(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """
     del outcome_draw
     assert action.arm is not None
-    if body.lifted is not None:
+    if body.hands.lifted is not None:
         raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
-    if body.at_furniture(action.arm):
+    if body.hands.at_furniture(action.arm):
         raise SkillFailure(FailureCode.IN_USE)
-    if body.held[action.arm] is None:
-        yield from body.move_hand(action.arm, 1.0)
+    if body.hands.held[action.arm] is None:
+        yield from body.hands.move(action.arm, 1.0)
     yield from stow(body, action.arm)
 
 

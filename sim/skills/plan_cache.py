@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from data.interface.steps import Action
-from sim.skills.body import Body
+from sim.skills.body.body import Body
 
 __all__ = ["cached_plan"]
 

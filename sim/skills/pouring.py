@@ -18,13 +18,13 @@ from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
-from sim.skills.body import Body, wait
+from sim.skills.body.body import Body
 from sim.skills.checks import check_fill, check_pour
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import OutcomeDraw, nudge, plan_bring, stow
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
-from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.skills.runner import CONTROL_DT_S, Skill, wait
 from sim.world.liquids import STEEP, opening_radius_m
 
 __all__ = ["assess_fill", "assess_pour", "fill", "pour"]
@@ -78,7 +78,7 @@ def assess_pour(body: Body, action: Action) -> tuple[Reach, float]:
 def _beside(body: Body, arm: Arm, vessel: ObjectInstance, top: Array, radius: float) -> list[Array]:
     """World points for the bottom of the vessel: so far beside that its rim comes over the opening when it is tilted."""
     height = float(vessel.local_max[2] - vessel.local_min[2])
-    sight = top[:2] - body.shoulder(arm)[:2]
+    sight = top[:2] - body.posture.shoulder(arm)[:2]
     across = np.array([-sight[1], sight[0]]) / max(float(np.linalg.norm(sight)), 1e-6)
     outer = 1.0 if arm is Arm.LEFT else -1.0
     spots = []
@@ -132,24 +132,24 @@ def pour(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     reach, turn = assess_pour(body, action)
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    target, vessel = body.thing(action.object_id), body.thing(body.held[arm] or "")
+    target, vessel = body.thing(action.object_id), body.thing(body.hands.held[arm] or "")
     outcome = outcome_draw(action)
-    yield from body.move_arm(arm, [*reach.way, reach.before])
-    yield from body.move_arm(arm, [reach.at], speed=0.6)
+    yield from body.arms.move(arm, [*reach.way, reach.before])
+    yield from body.arms.move(arm, [reach.at], speed=0.6)
     tilted = reach.at.copy()
     tilted[-1] += turn
     if outcome != "success":
         body.world.liquids.spill(vessel)
     before, had = target.state.fillLitres, vessel.state.fillLitres
     full = 0.999 * target.type.volume_l
-    pouring = body.move_arm(arm, [tilted], speed=0.35)
+    pouring = body.arms.move(arm, [tilted], speed=0.35)
     for _ in range(int(_LONGEST_S / CONTROL_DT_S)):
         next(pouring, None)  # then the arm stays as it is commanded
         yield
         if vessel.state.fillLitres <= 1e-6 or target.state.fillLitres >= full:
             break
-    yield from body.move_arm(arm, [reach.at])
-    yield from body.move_arm(arm, [reach.before])
+    yield from body.arms.move(arm, [reach.at])
+    yield from body.arms.move(arm, [reach.before])
     yield from stow(body, arm, (vessel.object_id,))
     if outcome != "success":
         raise SkillFailure(FailureCode.SPILLED, contingency=outcome)
@@ -174,7 +174,7 @@ def assess_fill(body: Body, action: Action) -> Reach:
     spots = [point - (0.0, 0.0, height + gap) for gap in (0.03, 0.06, 0.01)]
     basin = body.world.room.links.get(outlet.object_id)
     names = tuple(name for name in (vessel.object_id, outlet.object_id, basin) if name is not None)
-    aside = body.shoulder(action.arm) - point  # from the front: above it there is the spout
+    aside = body.posture.shoulder(action.arm) - point  # from the front: above it there is the spout
     aside = np.array([aside[0], aside[1], 0.0]) / np.hypot(aside[0], aside[1])
     return plan_bring(body, action.arm, vessel, spots, names, above_m=0.0, coming_from=aside)[1]
 
@@ -191,8 +191,8 @@ def fill(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     vessel, outlet = check_fill(body, arm, body.thing(action.object_id))
     outcome = outcome_draw(action)
     before = vessel.state.fillLitres
-    yield from body.move_arm(arm, [*reach.way, reach.before])
-    yield from body.move_arm(arm, [reach.at], speed=0.6)
+    yield from body.arms.move(arm, [*reach.way, reach.before])
+    yield from body.arms.move(arm, [reach.at], speed=0.6)
     full = 0.999 * vessel.type.volume_l
     for _ in range(_CORRECTIONS):
         yield from wait(0.1)
@@ -203,13 +203,13 @@ def fill(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
             break
         yield from nudge(body, arm, aside)
     for _ in range(int(_LONGEST_S / CONTROL_DT_S)):
-        if vessel.state.fillLitres >= full or body.held[arm] != vessel.object_id or outcome == "nothing":
+        if vessel.state.fillLitres >= full or body.hands.held[arm] != vessel.object_id or outcome == "nothing":
             break
         yield
     if outcome == "spilled":
         body.world.liquids.spill(vessel)
     yield from wait(0.1)
-    yield from body.move_arm(arm, [reach.before])
+    yield from body.arms.move(arm, [reach.before])
     yield from stow(body, arm, (vessel.object_id,))
     if outcome != "success":
         code = FailureCode.SPILLED if outcome == "spilled" else FailureCode.NOTHING_HAPPENED

@@ -21,8 +21,9 @@ from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.steps import Action
 from sim.scene.objects import MovingPart, ObjectInstance
-from sim.skills.body import ArmGoal, Body, wait
-from sim.skills.clearance import TOUCH_M
+from sim.skills.body.body import Body
+from sim.skills.body.clearance import TOUCH_M
+from sim.skills.body.ik import ArmGoal
 from sim.skills.door import Door
 from sim.skills.failures import SkillFailure
 from sim.skills.locomotion import step_to, sweep
@@ -31,7 +32,7 @@ from sim.skills.navigation import Stance
 from sim.skills.obstacles import navigation_map
 from sim.skills.reach import Reach, route
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import Skill
+from sim.skills.runner import Skill, wait
 
 __all__ = ["Push", "plan_push", "push_shut"]
 
@@ -116,7 +117,7 @@ class Push:
 
 def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> Push | None:
     """How one arm shuts a door by pushing, with as little walking as possible; None when no way was found."""
-    if any(name is not None and not body.thing(name).movable for name in body.held.values()):
+    if any(name is not None and not body.thing(name).movable for name in body.hands.held.values()):
         return None  # a hand at another door or drawer: walking would tear at it
     door = Door.of(body, thing, part)
     low, high = part.range
@@ -138,7 +139,7 @@ def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> 
 def _spots(body: Body, arm: Arm, door: Door, thing: ObjectInstance) -> list[tuple[float, float]]:
     """Where the fist may touch, as distances from the hinge and heights: beside the handle first, which would catch it."""
     model, data = body.world.model, body.world.data
-    shoulder_m = float(body.shoulder(arm)[2])
+    shoulder_m = float(body.posture.shoulder(arm)[2])
     low, high = door.heights
     clear: list[tuple[float, float]] = []
     at_handle: list[tuple[float, float]] = []
@@ -147,7 +148,7 @@ def _spots(body: Body, arm: Arm, door: Door, thing: ObjectInstance) -> list[tupl
         handle = data.site_xpos[door.part.handle_site]
         along_m, handle_z = float((handle - door.hinge(door.now)) @ door.along(door.now)), float(handle[2])
     long_m = high_m = 0.0  # half the handle's extent along the door and upwards, in excess of its thickness
-    for geom in body.part_geoms(thing, "handle"):
+    for geom in body.objects.part_geoms(thing, "handle"):
         half, axes = model.geom_aabb[geom, 3:], data.geom_xmat[geom].reshape(3, 3)
         long_m = max(long_m, float(np.abs(door.along(door.now) @ axes) @ half - np.min(half)))
         high_m = max(high_m, float(np.abs(axes[2]) @ half - np.min(half)))
@@ -168,9 +169,9 @@ def _spots(body: Body, arm: Arm, door: Door, thing: ObjectInstance) -> list[tupl
 
 def _stances(body: Body, arm: Arm, door: Door, spot: tuple[float, float], positions: Array) -> list[Array]:
     """Base poses (N, 3) along the way from which the arm may push at a spot (distance from the hinge, height), best first."""
-    base = body.commanded_base()
+    base = body.posture.stance()
     sites = np.stack([door.point(float(p), *spot, _FIST_M) for p in positions])
-    nav = body.navigation()
+    nav = body.workspace.navigation()
     first = _grid(door, base, sites[0])
     ways = nav.ways(base.position).costs_m(first[:, :2])
     here = np.zeros(len(first), dtype=bool)
@@ -215,7 +216,8 @@ def _stances(body: Body, arm: Arm, door: Door, spot: tuple[float, float], positi
         way = a[index] + shares[:, None] * change[index]
         if np.any(room.clearance(way[:, :2]) < -0.02):
             continue
-        if all(body.within(arm, s, body.pelvis_height_m, Stance(*map(float, p))) for s, p in zip(sites, way, strict=True)):
+        height = body.posture.pelvis_height_m
+        if all(body.ik.within(arm, s, height, Stance(*map(float, p))) for s, p in zip(sites, way, strict=True)):
             found.append(way)
             if len(found) >= _SOLVED:
                 break
@@ -235,7 +237,7 @@ def _grid(door: Door, base: Stance, site: Array) -> Array:
 
 def _strain(body: Body, arm: Arm, poses: Array, sites: Array) -> Array:
     """(M,) metres by which a hand at (M, 3) sites is too close to the shoulder or too far from it, infinite out of reach."""
-    shoulder, reach = body.maps[arm.value].shoulder, body.maps[arm.value].reach_m
+    shoulder, reach = body.ik.maps[arm.value].shoulder, body.ik.maps[arm.value].reach_m
     local = _shoulders(body, arm, poses)
     delta = sites - local
     distance = np.linalg.norm(delta, axis=1)
@@ -249,9 +251,9 @@ def _strain(body: Body, arm: Arm, poses: Array, sites: Array) -> Array:
 
 def _shoulders(body: Body, arm: Arm, poses: Array) -> Array:
     """(M, 3) shoulders of the robot at base poses (M, 3)."""
-    base = body.commanded_base()
-    delta = body.shoulder(arm) - (base.x, base.y, 0.0)
-    local = body.turn_to_pelvis(delta)
+    base = body.posture.stance()
+    delta = body.posture.shoulder(arm) - (base.x, base.y, 0.0)
+    local = body.posture.turn_to_pelvis(delta)
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = c * local[0] - s * local[1], s * local[0] + c * local[1]
     return np.stack([poses[:, 0] + x, poses[:, 1] + y, np.full(len(poses), local[2])], axis=1)
@@ -282,10 +284,10 @@ def _wrapped(angle: Array) -> Array:
 
 def _solve(body: Body, arm: Arm, door: Door, spot: tuple[float, float], positions: Array, stances: Array) -> Push | None:
     """The arm's postures along the way, None when it cannot follow or would collide."""
-    base = body.commanded_base()
+    base = body.posture.stance()
     first = Stance(*map(float, stances[0]))
     there = body.assuming(stance=first)  # a hand that is at the door already would move it
-    states = [there.probe.against_door(a, body.commanded_arm(a), door.part, door.now, fist=False) for a in Arm]
+    states = [there.probe.against_door(a, body.arms.commanded(a), door.part, door.now, fist=False) for a in Arm]
     if any(state.gap_m < (_HAND_ROOM_M if door.before(state, door.now) else _FINGERS_M) for state in states):
         return None
     for wish in _directions(body, arm, door, spot, float(positions[0]), first):
@@ -312,7 +314,7 @@ def _solve(body: Body, arm: Arm, door: Door, spot: tuple[float, float], position
         moves = float(np.hypot(first.x - base.x, first.y - base.y)) + abs(
             float(_wrapped(np.array(first.yaw_rad - base.yaw_rad)))
         )
-        way = body.navigation().ways(base.position).to(first.position) if moves > 1e-3 else None
+        way = body.workspace.navigation().ways(base.position).to(first.position) if moves > 1e-3 else None
         if moves > 1e-3 and way is None:
             return None
         return Push(reach, door.part, positions, np.stack(postures), stances, away, way)
@@ -349,7 +351,7 @@ def _at_face(
     """An arm posture whose fist presses on the door, and how far the grasp site then is before the face."""
     there = body.assuming(stance=stance)
     for _ in range(4):
-        goal = there.solve(arm, HandPose(door.point(position, *spot, out_m), pointing), start)
+        goal = there.ik.solve(arm, HandPose(door.point(position, *spot, out_m), pointing), start)
         if goal.error_m > 0.025:
             return None
         state = there.probe.against_door(arm, goal.q, door.part, position)
@@ -368,7 +370,7 @@ def _away(body: Body, arm: Arm, door: Door, positions: Array, postures: Array, s
     order = np.argsort(positions, kind="stable")
     at = np.array([np.interp(shut, positions[order], column[order]) for column in postures.T])
     there = body.assuming(stance=stance)
-    goal = there.solve(arm, HandPose(there.hand_at(arm, at) + _BEFORE_M * door.normal(shut)), start=at)
+    goal = there.ik.solve(arm, HandPose(there.ik.hand_at(arm, at) + _BEFORE_M * door.normal(shut)), start=at)
     if goal.error_m > 0.04:
         return None
     shares = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -379,11 +381,11 @@ def _away(body: Body, arm: Arm, door: Door, positions: Array, postures: Array, s
 
 def _approach(body: Body, arm: Arm, door: Door, spot: tuple[float, float], position: float, at: Array) -> Reach | None:
     """The way of the fist to its first contact, from the assumed stance."""
-    hand = body.hand_at(arm, at)
+    hand = body.ik.hand_at(arm, at)
     for out in (door.normal(position), 0.7 * door.normal(position) + 0.7 * door.along(position)):
         before: ArmGoal | None = None
         for distance in (_BEFORE_M, 0.6 * _BEFORE_M):
-            before = body.solve(arm, HandPose(hand + distance * out), start=at)
+            before = body.ik.solve(arm, HandPose(hand + distance * out), start=at)
             if before.error_m <= 0.024 and float(np.max(np.abs(before.q - at))) < 1.5:
                 break
             before = None
@@ -403,15 +405,15 @@ def _route(
     body: Body, arm: Arm, door: Door, spot: tuple[float, float], position: float, goal: Array
 ) -> tuple[Array, ...] | None:
     """Postures to pass on the way to `goal`: the usual ones, or one beyond the door's free edge."""
-    start = body.commanded_arm(arm)
+    start = body.arms.commanded(arm)
     way = route(body, arm, start, goal, (), 0.0)
     if way is not None:
         return way
     for beyond, out in ((0.12, 0.08), (0.12, -0.05), (0.2, 0.0)):
         point = door.point(position, door.width_m + beyond, spot[1], out)
-        if not body.within(arm, point, body.pelvis_height_m):
+        if not body.ik.within(arm, point, body.posture.pelvis_height_m):
             continue
-        via = body.solve(arm, HandPose(point), start=goal)
+        via = body.ik.solve(arm, HandPose(point), start=goal)
         if via.error_m > 0.03:
             continue
         first, second = route(body, arm, start, via.q, (), 0.0), route(body, arm, via.q, goal, (), 0.0)
@@ -437,9 +439,9 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
         yield from step_to(body, push.way, float(push.stances[0, 2]))
         if part.travel_m(float(body.world.data.qpos[part.qpos_adr] - push.positions[0])) > _TAKEN_ALONG_M:
             return
-    yield from body.move_hand(arm, 0.0, 0.2)
-    yield from body.move_arm(arm, [*push.reach.way, push.reach.before])
-    yield from body.move_arm(arm, [push.reach.at], speed=0.5)
+    yield from body.hands.move(arm, 0.0, 0.2)
+    yield from body.arms.move(arm, [*push.reach.way, push.reach.before])
+    yield from body.arms.move(arm, [push.reach.at], speed=0.5)
     yield from wait(0.1)
     panel = np.flatnonzero(body.world.model.geom_bodyid == part.body_id)
     gap = body.probe.limb_gap_m(arm, panel)
@@ -452,7 +454,7 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
         yield from _draw_back(body, arm, push.reach.before[None])
         code = FailureCode.LOCKED if outcome == "locked" else FailureCode.NOTHING_HAPPENED
         raise SkillFailure(code, contingency=outcome)
-    stances = push.stances + (0.0, 0.0, body.commanded_base().yaw_rad - push.stances[0, 2])  # the same turn of the heading
+    stances = push.stances + (0.0, 0.0, body.posture.stance().yaw_rad - push.stances[0, 2])  # the same turn of the heading
     length = part.travel_m(float(push.positions[-1] - push.positions[0]))
     yield from sweep(body, arm, push.postures, stances, 1.875 * max(length, 0.1) / _EDGE_SPEED)
     yield from wait(0.2)
@@ -461,6 +463,6 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
 
 def _draw_back(body: Body, arm: Arm, away: Array) -> Skill:
     """Takes the fist off the face, straight out, and brings the arm home with an open hand."""
-    yield from body.move_arm(arm, list(away))
-    yield from body.move_hand(arm, 1.0, 0.2)
+    yield from body.arms.move(arm, list(away))
+    yield from body.hands.move(arm, 1.0, 0.2)
     yield from stow(body, arm)

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
-from sim.skills.body import REACH_TOLERANCE_M, ArmGoal, Body
+from sim.skills.body.body import Body
+from sim.skills.body.ik import REACH_TOLERANCE_M, ArmGoal
 from sim.skills.failures import SkillFailure
 from sim.skills.reach_map import HandPose
 
@@ -63,10 +64,10 @@ def diagnose(body: Body, points: Mapping[Arm, Array], plan: Callable[[Body], obj
     """
     if not body.hypothesis.diagnose:
         return SkillFailure(FailureCode.OBSTRUCTED)
-    present = body.pelvis_height_m
-    common = [height for height in body.heights() if all(body.within(arm, p, height) for arm, p in points.items())]
+    present = body.posture.pelvis_height_m
+    common = [height for height in body.ik.heights() if all(body.ik.within(arm, p, height) for arm, p in points.items())]
     gap = max(
-        max(body.maps[a.value].beyond_m(body.in_trunk(p)), body.maps[a.value].gap_m(body.in_trunk(p)))
+        max(body.ik.maps[a.value].beyond_m(body.posture.in_trunk(p)), body.ik.maps[a.value].gap_m(body.posture.in_trunk(p)))
         for a, p in points.items()
     )
     for height in sorted(common, key=lambda height: abs(height - present)):
@@ -78,7 +79,7 @@ def diagnose(body: Body, points: Mapping[Arm, Array], plan: Callable[[Body], obj
             continue
         code = FailureCode.BODY_TOO_HIGH if height < present else FailureCode.BODY_TOO_LOW
         return SkillFailure(code, {"height_m": height - present, "reach_m": gap})
-    if not common or not all(body.within(arm, p, present) for arm, p in points.items()):
+    if not common or not all(body.ik.within(arm, p, present) for arm, p in points.items()):
         return SkillFailure(FailureCode.TOO_FAR, {"reach_m": gap})
     return SkillFailure(FailureCode.OBSTRUCTED, {"gap_m": gap})
 
@@ -101,7 +102,7 @@ def route(
     """Postures to pass between two arm postures without a collision: none, or one with the hand drawn in or raised."""
     ignore = tuple(ignore)
     best: tuple[float, tuple[Array, ...]] | None = None
-    for via in (None, *body.vias(arm)):
+    for via in (None, *body.ik.vias(arm)):
         legs = [(start, goal)] if via is None else [(start, via), (via, goal)]
         worst = 0.0
         for number, (a, b) in enumerate(legs):
@@ -145,15 +146,15 @@ def plan_reach(
         opening: opening of the hand on the way, None as it is.
         start: (A,) joints near the solution, when they are known.
     """
-    if not body.within(arm, wish.position, body.pelvis_height_m):
+    if not body.ik.within(arm, wish.position, body.posture.pelvis_height_m):
         return None
-    at = body.solve(arm, wish, start)
+    at = body.ik.solve(arm, wish, start)
     if not fulfils(at, pointing, closing) or not body.probe.free(arm, [at.q], ignore, opening):
         return None
     before = None
     for share in (1.0, 0.6):
         short = HandPose(wish.position + share * distance_m * retreat, wish.pointing, wish.closing, wish.either_way)
-        before = body.solve(arm, short, start=at.q)
+        before = body.ik.solve(arm, short, start=at.q)
         if before.error_m <= 2.0 * REACH_TOLERANCE_M and float(np.max(np.abs(before.q - at.q))) < 1.5:
             break
         before = None
@@ -162,5 +163,5 @@ def plan_reach(
     approach = [before.q + share * (at.q - before.q) for share in (0.0, 0.2, 0.4, 0.6, 0.8)]
     if not body.probe.free(arm, approach, ignore, opening):
         return None
-    way = route(body, arm, body.commanded_arm(arm), before.q, (), opening)
+    way = route(body, arm, body.arms.commanded(arm), before.q, (), opening)
     return None if way is None else Reach(way, before.q, at.q)

@@ -8,7 +8,7 @@ from typing import Final
 from data.interface.failures import FailureCode
 from data.interface.steps import Action, PlanStep
 from sim.skills import articulate, holding, locomotion, manipulate, pouring, set_down, tools, two_arm
-from sim.skills.body import Body
+from sim.skills.body.body import Body
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import OutcomeDraw
 from sim.skills.push import Push
@@ -59,7 +59,7 @@ def skills_for(body: Body, step: PlanStep, known: frozenset[str], outcome_draw: 
             skills.append((action, refuse(FailureCode.ARM_CONFLICT)))
         elif action.object_id is not None and action.object_id not in known:
             skills.append((action, refuse(FailureCode.OBJECT_NOT_KNOWN)))
-        elif action.name in BODY_SKILLS and body.at_furniture():
+        elif action.name in BODY_SKILLS and body.hands.at_furniture():
             skills.append((action, refuse(FailureCode.IN_USE)))
         elif action.name in BODY_SKILLS:
             skills.append((action, BODY_SKILLS[action.name](body, action)))

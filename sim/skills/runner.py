@@ -18,7 +18,7 @@ from data.interface.feedback import ActionOutcome
 from data.interface.steps import Action
 from sim.skills.failures import SkillFailure, failed, succeeded
 
-__all__ = ["CONTROL_DT_S", "Skill", "run_skills"]
+__all__ = ["CONTROL_DT_S", "Skill", "run_skills", "wait"]
 
 #: A coroutine that acts between its yields.
 Skill = Generator[None, None, None]
@@ -66,3 +66,9 @@ def refuse(code: FailureCode, margins: dict[str, float] | None = None) -> Skill:
     """A skill that fails at once, for actions that are refused before anything moves."""
     raise SkillFailure(code, margins)
     yield
+
+
+def wait(seconds: float) -> Skill:
+    """Lets physics run."""
+    for _ in range(round(seconds / CONTROL_DT_S)):
+        yield

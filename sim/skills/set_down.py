@@ -20,15 +20,16 @@ from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
-from sim.skills.body import Body, BothGoal, wait
+from sim.skills.body.body import Body
+from sim.skills.body.clearance import TOUCH_M
+from sim.skills.body.ik import BothGoal
 from sim.skills.checks import check_place_both
-from sim.skills.clearance import TOUCH_M
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import OutcomeDraw, upright
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import diagnose
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.skills.runner import CONTROL_DT_S, Skill, wait
 from sim.skills.two_arm import BOTH_TOLERANCE_M, against_sag, hands_m
 
 __all__ = ["BothPlacement", "assess_place_both", "place_both"]
@@ -76,20 +77,20 @@ def assess_place_both(body: Body, action: Action) -> BothPlacement:
     assert action.object_id is not None
     receptacle = body.thing(action.object_id)
     thing = check_place_both(body, receptacle)
-    spots = body.free_spots(thing, receptacle, None)
+    spots = body.workspace.free_spots(thing, receptacle, None)
     if not spots:
         raise SkillFailure(FailureCode.RECEPTACLE_FULL)
     load = _Load.of(body, thing)
     heights = [_height_over(body, load, spot) for spot in spots]
-    carried_m = body.hand_height(_hold(body))
+    carried_m = body.ik.hand_height(_hold(body))
 
     def search(body: Body) -> BothPlacement:
-        higher_m = body.hand_height(_hold(body)) - carried_m  # the load comes along with the pelvis
+        higher_m = body.ik.hand_height(_hold(body)) - carried_m  # the load comes along with the pelvis
         for spot, over_m in zip(spots, heights, strict=True):
             if over_m is None:
                 continue
-            at = body.solve_both(load.hands(load.above(spot + 0.004 * _UP)), body.commanded_both())
-            above = body.solve_both(load.hands(load.above(spot + over_m * _UP)), at.arms)
+            at = body.ik.solve_both(load.hands(load.above(spot + 0.004 * _UP)), body.arms.commanded_both())
+            above = body.ik.solve_both(load.hands(load.above(spot + over_m * _UP)), at.arms)
             over = load.bottom_m + higher_m > spot[2] + _EDGE_M
             if at.error_m > BOTH_TOLERANCE_M or above.error_m > 1.5 * BOTH_TOLERANCE_M:
                 continue
@@ -105,12 +106,12 @@ def assess_place_both(body: Body, action: Action) -> BothPlacement:
         return search(body)
     except SkillFailure:
         way = load.above(spots[0])[:3, 3] - load.turned[:3, 3]
-        raise diagnose(body, {arm: body.hand_pose(arm)[0] + way for arm in Arm}, search) from None
+        raise diagnose(body, {arm: body.arms.hand_pose(arm)[0] + way for arm in Arm}, search) from None
 
 
 def _hold(body: Body) -> BothGoal:
     """The posture that is commanded."""
-    return BothGoal(body.commanded_both(), body.commanded_waist(), 0.0)
+    return BothGoal(body.arms.commanded_both(), body.arms.commanded_waist(), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +138,7 @@ class _Load:
     def of(cls, body: Body, thing: ObjectInstance) -> _Load:
         """What is held now."""
         pose = body.world.poses.pose(thing.object_id)
-        hands = {arm: _pose(*body.hand_pose(arm)) for arm in Arm}
+        hands = {arm: _pose(*body.arms.hand_pose(arm)) for arm in Arm}
         bottom_m = float(body.world.poses.bounds(thing.object_id)[0][2])
         turned, sole_m = pose, float(pose[2, 3]) - bottom_m
         if float(np.arccos(np.clip(pose[2, 2], -1.0, 1.0))) > _LEANING_RAD:
@@ -183,7 +184,7 @@ def _raised(body: Body, load: _Load, level_m: float, higher_m: float, lean_rad: 
     present_m = float(load.turned[2, 3]) - load.sole_m + higher_m
     for extra_m in _EXTRA_M:
         bottom_m = max(level_m, present_m) + extra_m
-        goal = body.solve_both(load.hands(load.above(np.array([*load.turned[:2, 3], bottom_m]))), body.commanded_both())
+        goal = body.ik.solve_both(load.hands(load.above(np.array([*load.turned[:2, 3], bottom_m]))), body.arms.commanded_both())
         if goal.error_m > BOTH_TOLERANCE_M or goal.tilt_rad > lean_rad:
             continue
         if np.isinf(lean_rad) or bottom_m - load.sunk_m(goal.tilt_rad) >= level_m - _EDGE_M:
@@ -226,45 +227,45 @@ def place_both(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """
     placement = assess_place_both(body, action)
     assert action.object_id is not None
-    thing, receptacle = body.thing(body.lifted or ""), body.thing(action.object_id)
+    thing, receptacle = body.thing(body.hands.lifted or ""), body.thing(action.object_id)
     hold, first = _hold(body), []
     if placement.raised is not None:
         first = [placement.raised]
-        yield from body.move_both(first, speed=0.6)
+        yield from body.arms.move_both(first, speed=0.6)
         yield from wait(0.1)
         if _under_m(body, thing, placement) > -_EDGE_M:
-            higher = against_sag(body, body.hand_height(placement.raised) - hands_m(body))
+            higher = against_sag(body, body.ik.hand_height(placement.raised) - hands_m(body))
             if higher is not None:
                 first = [higher]
-                yield from body.move_both(first, speed=0.5)
+                yield from body.arms.move_both(first, speed=0.5)
         under_m = _under_m(body, thing, placement)
         if under_m > 0.0:
-            yield from body.move_both([hold], speed=0.6)
+            yield from body.arms.move_both([hold], speed=0.6)
             raise SkillFailure(FailureCode.BODY_TOO_LOW, {"height_m": under_m + _EDGE_M})
-    yield from body.move_both([placement.above], speed=0.6)
+    yield from body.arms.move_both([placement.above], speed=0.6)
     outcome = outcome_draw(action)
     if outcome != "success":
-        yield from body.move_both([*first, hold], speed=0.6)
+        yield from body.arms.move_both([*first, hold], speed=0.6)
         raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
-    for _ in body.move_both([placement.at], speed=0.4):
+    for _ in body.arms.move_both([placement.at], speed=0.4):
         yield
-        if body.rests(thing):
+        if body.contacts.rests(thing):
             break
     yield from wait(0.1)
     for arm in Arm:
         body.world.grasps.detach(arm.value)
     wishes = {}
-    outward = body.turn_to_world(np.array([0.0, 1.0, 0.0]))
+    outward = body.posture.turn_to_world(np.array([0.0, 1.0, 0.0]))
     for arm, sign in ((Arm.LEFT, 1.0), (Arm.RIGHT, -1.0)):
-        position, hand = body.hand_pose(arm)
+        position, hand = body.arms.hand_pose(arm)
         wishes[arm] = HandPose(position + sign * 0.09 * outward + 0.01 * _UP, hand[:, 0], hand[:, 1])
-    apart = body.solve_both(wishes, body.commanded_both())
-    yield from body.move_both([apart], speed=0.6)
-    yield from body.stow_both()
+    apart = body.ik.solve_both(wishes, body.arms.commanded_both())
+    yield from body.arms.move_both([apart], speed=0.6)
+    yield from body.arms.stow_both()
     for _ in range(int(0.6 / CONTROL_DT_S)):
         if body.world.poses.speed_m_s(thing.object_id) < 0.02:
             break
         yield
     if receptacle.object_id not in body.world.containment.parents(thing.object_id):
-        gap = float(np.linalg.norm(body.world_position(thing.object_id) - body.world_position(receptacle.object_id)))
+        gap = float(np.linalg.norm(body.objects.center(thing.object_id) - body.objects.center(receptacle.object_id)))
         raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})

@@ -18,13 +18,13 @@ from data.interface.failures import FailureCode
 from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.articulate import plan_press
-from sim.skills.body import Body, wait
+from sim.skills.body.body import Body
 from sim.skills.checks import check_clean, check_slice, check_use_up
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, nudge, plan_bring, stow
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
-from sim.skills.runner import Skill
+from sim.skills.runner import Skill, wait
 
 __all__ = ["assess_clean", "assess_slice", "assess_use_up", "clean", "slice_object", "use_up"]
 
@@ -73,7 +73,7 @@ def assess_clean(body: Body, action: Action) -> Reach:
     tool = check_clean(body, action.arm, thing)
     spots = [np.asarray(puddle.position) for puddle in body.world.liquids.puddles if puddle.surface == thing.object_id]
     if not spots:
-        spots = [_top(body, thing)] if thing.movable else body.free_spots(tool, thing, action.arm)
+        spots = [_top(body, thing)] if thing.movable else body.workspace.free_spots(tool, thing, action.arm)
     if not spots:
         raise SkillFailure(FailureCode.OBSTRUCTED)
     return plan_bring(body, action.arm, tool, spots, (tool.object_id, thing.object_id), above_m=0.002)[1]
@@ -131,16 +131,16 @@ def use_up(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     reach = assess_use_up(body, action)
     assert action.arm is not None and action.object_id is not None
     arm, thing = action.arm, body.thing(action.object_id)
-    yield from body.move_hand(arm, body.spec.hand.press[2], 0.2)
-    yield from body.move_arm(arm, [*reach.way, reach.before])
-    yield from body.touch(arm, reach.at, body.solid_geoms(thing), speed=0.7)
+    yield from body.hands.move(arm, body.spec.hand.press[2], 0.2)
+    yield from body.arms.move(arm, [*reach.way, reach.before])
+    yield from body.arms.touch(arm, reach.at, body.objects.solid_geoms(thing), speed=0.7)
     yield from wait(0.1)
-    gap = body.probe.hand_gap_m(arm, body.solid_geoms(thing))
+    gap = body.probe.hand_gap_m(arm, body.objects.solid_geoms(thing))
     outcome = outcome_draw(action)
     if gap <= GRASP_GAP_M and outcome == "success":
         body.world.states.set_state(thing.object_id, "isUsedUp", True)
-    yield from body.move_arm(arm, [reach.before])
-    yield from body.move_hand(arm, 1.0, 0.2)
+    yield from body.arms.move(arm, [reach.before])
+    yield from body.hands.move(arm, 1.0, 0.2)
     yield from stow(body, arm, (thing.object_id,))
     _judge(gap, outcome)
 
@@ -162,10 +162,10 @@ def _apply(
     """
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    thing, tool = body.thing(action.object_id), body.thing(body.held[arm] or "")
-    yield from body.move_arm(arm, [*reach.way, reach.before])
-    yield from body.move_arm(arm, [reach.at], speed=0.6)
-    mine, theirs = body.solid_geoms(tool), body.solid_geoms(thing)
+    thing, tool = body.thing(action.object_id), body.thing(body.hands.held[arm] or "")
+    yield from body.arms.move(arm, [*reach.way, reach.before])
+    yield from body.arms.move(arm, [reach.at], speed=0.6)
+    mine, theirs = body.objects.solid_geoms(tool), body.objects.solid_geoms(thing)
     yield from wait(0.06)
     gap = body.probe.gap_m(mine, theirs)
     for _ in range(_PRESS_STEPS):
@@ -175,7 +175,7 @@ def _apply(
         gap = body.probe.gap_m(mine, theirs)
     outcome = outcome_draw(action)
     if gap <= GRASP_GAP_M and outcome == "success":
-        along = body.turn_to_world(np.array([1.0, 0.0, 0.0]))
+        along = body.posture.turn_to_world(np.array([1.0, 0.0, 0.0]))
         for _ in range(_STROKES):
             yield from nudge(body, arm, _STROKE_M * along)
             yield from nudge(body, arm, -_STROKE_M * along)
@@ -187,5 +187,5 @@ def _apply(
 
 
 def _leave(body: Body, arm: Arm, reach: Reach, tool: ObjectInstance) -> Skill:
-    yield from body.move_arm(arm, [reach.before])
+    yield from body.arms.move(arm, [reach.before])
     yield from stow(body, arm, (tool.object_id,))

@@ -17,7 +17,8 @@ from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
-from sim.skills.body import Body, BothGoal, wait
+from sim.skills.body.body import Body
+from sim.skills.body.ik import BothGoal
 from sim.skills.checks import check_lift
 from sim.skills.failures import SkillFailure
 from sim.skills.grasps import solid_box
@@ -25,7 +26,7 @@ from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import diagnose, route
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.skills.runner import CONTROL_DT_S, Skill, wait
 
 __all__ = ["BOTH_TOLERANCE_M", "against_sag", "assess_lift", "hands_m", "lift"]
 
@@ -62,7 +63,7 @@ def _sides(body: Body, thing: ObjectInstance) -> dict[Arm, tuple[Array, Array]]:
     low, high = solid_box(thing)
     center = pose[:3, 3] + rotation @ (0.5 * (low + high))
     half = 0.5 * (high - low)
-    left = body.turn_to_world(np.array([0.0, 1.0, 0.0]))
+    left = body.posture.turn_to_world(np.array([0.0, 1.0, 0.0]))
     axis = int(np.argmax([abs(float(rotation[:, 0] @ left)), abs(float(rotation[:, 1] @ left))]))
     lateral = rotation[:, axis] * np.sign(rotation[:, axis] @ left)
     points: dict[Arm, tuple[Array, Array]] = {}
@@ -80,12 +81,12 @@ def _sides(body: Body, thing: ObjectInstance) -> dict[Arm, tuple[Array, Array]]:
 
 def _goal(body: Body, sides: Mapping[Arm, tuple[Array, Array]], apart_m: float, start: Mapping[Arm, Array] | None) -> BothGoal:
     """Both hands beside the object, `apart_m` from its surfaces, fingers ahead and palms inward."""
-    ahead = body.turn_to_world(np.array([0.94, 0.0, -0.34]))
+    ahead = body.posture.turn_to_world(np.array([0.94, 0.0, -0.34]))
     wishes = {}
     for arm, (point, normal) in sides.items():
         inward = -normal
-        wishes[arm] = HandPose(point + (apart_m - body.palm_m()) * normal, ahead, inward)
-    return body.solve_both(wishes, start)
+        wishes[arm] = HandPose(point + (apart_m - body.spec.hand.behind_m) * normal, ahead, inward)
+    return body.ik.solve_both(wishes, start)
 
 
 @cached_plan
@@ -124,12 +125,12 @@ def _way(body: Body, goal: BothGoal) -> BothGoal:
     """A posture of both arms half way to a goal, by a detour where the straight way meets something."""
     middle: dict[Arm, Array] = {}
     for arm in Arm:
-        start = body.commanded_arm(arm)
+        start = body.arms.commanded(arm)
         found = route(body, arm, start, goal.arms[arm], (), 1.0)
         if found is None:
-            found = (body.vias(arm)[1],)
+            found = (body.ik.vias(arm)[1],)
         middle[arm] = found[0] if found else 0.5 * (start + goal.arms[arm])
-    return BothGoal(middle, 0.5 * (body.commanded_waist() + goal.waist), 0.0)
+    return BothGoal(middle, 0.5 * (body.arms.commanded_waist() + goal.waist), 0.0)
 
 
 def lift(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
@@ -142,26 +143,26 @@ def lift(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     assert action.object_id is not None
     thing = body.thing(action.object_id)
     for arm in Arm:
-        body.command_hand(arm, 1.0)
-    yield from body.move_both([reach.way, reach.before])
+        body.hands.command(arm, 1.0)
+    yield from body.arms.move_both([reach.way, reach.before])
     yield from _press(body, reach, thing)
-    gaps = {arm: body.probe.hand_gap_m(arm, body.solid_geoms(thing)) for arm in Arm}
+    gaps = {arm: body.probe.hand_gap_m(arm, body.objects.solid_geoms(thing)) for arm in Arm}
     if max(gaps.values()) > GRASP_GAP_M:
-        yield from body.move_both([reach.before])
-        yield from body.stow_both()
+        yield from body.arms.move_both([reach.before])
+        yield from body.arms.stow_both()
         raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": max(gaps.values())})
     outcome = outcome_draw(action)
     for arm in Arm:
         body.world.grasps.attach(arm.value, thing.object_id)
     first = _shifted(body, _FIRST_M, 0.0)
-    yield from body.move_both([first], speed=0.5)
+    yield from body.arms.move_both([first], speed=0.5)
     if outcome != "success":
         for arm in Arm:
             body.world.grasps.detach(arm.value)
         if outcome == "spilled":
             body.world.liquids.spill(thing)
-        yield from body.move_both([reach.before])
-        yield from body.stow_both()
+        yield from body.arms.move_both([reach.before])
+        yield from body.arms.stow_both()
         code = FailureCode.SPILLED if outcome == "spilled" else FailureCode.SLIPPED
         raise SkillFailure(code, contingency=outcome)
     options = [(up, _shifted(body, up, back)) for up, back in _HOLDS]
@@ -169,24 +170,24 @@ def lift(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     if options:
         before_m = hands_m(body)
         up, hold = min(options, key=lambda option: option[1].tilt_rad - _HEIGHT_WEIGHT * option[0])
-        yield from body.move_both([hold], speed=0.5)
+        yield from body.arms.move_both([hold], speed=0.5)
         yield from wait(0.1)
         higher = against_sag(body, before_m + up - hands_m(body))
         if higher is not None:
-            yield from body.move_both([higher], speed=0.5)
+            yield from body.arms.move_both([higher], speed=0.5)
     yield from wait(0.1)
-    if body.lifted != thing.object_id or thing.object_id in body.world.containment.all_parents():
+    if body.hands.lifted != thing.object_id or thing.object_id in body.world.containment.all_parents():
         for arm in Arm:
-            if thing.object_id == body.held[arm] or arm.value in thing.held_by:
+            if thing.object_id == body.hands.held[arm] or arm.value in thing.held_by:
                 body.world.grasps.detach(arm.value)
-        yield from body.move_both([reach.before])
-        yield from body.stow_both()
+        yield from body.arms.move_both([reach.before])
+        yield from body.arms.stow_both()
         raise SkillFailure(FailureCode.DROPPED)
 
 
 def hands_m(body: Body) -> float:
     """Mean height of both hands as they are, metres."""
-    return float(np.mean([body.hand_pose(arm)[0][2] for arm in Arm]))
+    return float(np.mean([body.arms.hand_pose(arm)[0][2] for arm in Arm]))
 
 
 def against_sag(body: Body, sag_m: float) -> BothGoal | None:
@@ -199,8 +200,8 @@ def against_sag(body: Body, sag_m: float) -> BothGoal | None:
 
 def _press(body: Body, reach: BothReach, thing: ObjectInstance) -> Skill:
     """Moves both hands inwards; each one stops when it touches."""
-    geoms = body.solid_geoms(thing)
-    start = body.commanded_both()
+    geoms = body.objects.solid_geoms(thing)
+    start = body.arms.commanded_both()
     steps = round(0.5 / CONTROL_DT_S)
     share = dict.fromkeys(Arm, 0.0)
     for k in range(1, round(1.3 * steps) + 1):
@@ -208,15 +209,15 @@ def _press(body: Body, reach: BothReach, thing: ObjectInstance) -> Skill:
             if k % 2 == 0 and body.probe.hand_gap_m(arm, geoms) < 0.001:
                 continue
             share[arm] = min(k / steps, 1.3)
-            body.command_arm(arm, start[arm] + share[arm] * (reach.at.arms[arm] - start[arm]))
+            body.arms.command(arm, start[arm] + share[arm] * (reach.at.arms[arm] - start[arm]))
         yield
 
 
 def _shifted(body: Body, up_m: float, back_m: float) -> BothGoal:
     """Both hands moved by the same displacement, their orientation kept."""
-    move = up_m * _UP - back_m * body.turn_to_world(np.array([1.0, 0.0, 0.0]))
+    move = up_m * _UP - back_m * body.posture.turn_to_world(np.array([1.0, 0.0, 0.0]))
     wishes = {}
     for arm in Arm:
-        position, hand = body.hand_pose(arm)
+        position, hand = body.arms.hand_pose(arm)
         wishes[arm] = HandPose(position + move, hand[:, 0], hand[:, 1])
-    return body.solve_both(wishes, body.commanded_both())
+    return body.ik.solve_both(wishes, body.arms.commanded_both())

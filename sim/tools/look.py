@@ -70,21 +70,21 @@ def robot_poses(robot: str, size: int = 420) -> NDArray[np.uint8]:
     low, high = session.body.spec.pelvis_height_range_m
     pictures = []
     for height in (high, low):
-        change = height - session.body.pelvis_height_m
+        change = height - session.body.posture.pelvis_height_m
         if abs(change) > 0.005:
             session.act(PlanStep((Action("MoveUp" if change > 0 else "MoveDown", amount=round(abs(change), 2)),)))
         pictures.append(_portrait(session, size))
     session.reset(task, seed=0)
     expert = Expert(session)
     expert.reset()
-    while session.body.lifted is None and not session.finished:
+    while session.body.hands.lifted is None and not session.finished:
         session.step(expert.next_step())
     return np.concatenate([*pictures, _portrait(session, size)], axis=1)
 
 
 def _portrait(session: Session, size: int) -> NDArray[np.uint8]:
     """The robot from its front left, without the walls between."""
-    world, base = session.world, session.body.base()
+    world, base = session.world, session.body.base.measured()
     camera = mujoco.MjvCamera()
     tall_m = session.body.spec.standing_pelvis_height_m
     camera.lookat[:] = [base.x, base.y, 0.9 * tall_m]

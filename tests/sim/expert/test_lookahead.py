@@ -21,20 +21,20 @@ def session():
     session.reset(task, seed=task.seed)
     expert = Expert(session)
     expert.reset()
-    while not any(session.body.held.values()):
+    while not any(session.body.hands.held.values()):
         session.step(expert.next_step())
     yield session
     session.close()
 
 
 def _ways(session):
-    bearer = next(arm for arm in Arm if session.body.held[arm] is not None)
+    bearer = next(arm for arm in Arm if session.body.hands.held[arm] is not None)
     return Action("Open", bearer.other, DRAWER), Action("Place", bearer, DRAWER)
 
 
 def test_a_drawer_is_imagined_open_before_it_is_opened_in_thought(session):
     rehearsal, (first, then) = Rehearsal(session), _ways(session)
-    here = session.body.commanded_base()
+    here = session.body.posture.stance()
     stances = [rehearsal.stance_of(Action("GoTo", object_id=DRAWER, bearing_deg=b)) for b in (None, -20.0, 20.0)]
     before, openness = session.world.data.qpos.copy(), session.world.objects[DRAWER].openness
     asked = {
@@ -48,13 +48,13 @@ def test_a_drawer_is_imagined_open_before_it_is_opened_in_thought(session):
     }
     assert any(acted for _, acted in asked.values()), asked
     assert all(might or not acted for might, acted in asked.values()), "nothing is ruled out that works"
-    assert not rehearsal.might_lead_to(first, then, here, session.body.pelvis_height_m), "too far away from here"
+    assert not rehearsal.might_lead_to(first, then, here, session.body.posture.pelvis_height_m), "too far away from here"
     assert session.world.objects[DRAWER].openness == openness < 0.02
     assert np.array_equal(session.world.data.qpos, before)
 
 
 def test_two_arms_together_need_both_targets_in_reach(session):
     rehearsal, (first, then) = Rehearsal(session), _ways(session)
-    assert not rehearsal.works_together([(first, then)], session.body.commanded_base())
+    assert not rehearsal.works_together([(first, then)], session.body.posture.stance())
     stance = rehearsal.stance_of(Action("GoTo", object_id=DRAWER))
     assert not rehearsal.works_together([(first, then)], stance), "what is shut cannot be filled"

@@ -61,14 +61,14 @@ def test_parallel_pair_of_dualthor(controller):
 def test_save_load_and_teleport(controller):
     controller.reset()
     controller.step(action="SaveState", name="here")
-    x, y = controller.session.body.navigation().free_positions()[0]
+    x, y = controller.session.body.workspace.navigation().free_positions()[0]
     assert controller.step(action="TP", x=float(x), y=float(y), rotation=90).metadata["actionReturn"] is True
     assert np.allclose(controller.session.world.servos.base_pose[:2], (x, y))
     assert not controller.step(action="TP", x=99.0, y=0.0).metadata["lastActionSuccess"]
     assert not controller.step(action="TP", x=1e308, y=0.0).metadata["lastActionSuccess"]
     for rotation in (1e308, -1e308, 36090.0):
         assert controller.step(action="TP", x=float(x), y=float(y), rotation=rotation).metadata["lastActionSuccess"]
-        assert abs(controller.session.body.base().yaw_rad) <= np.pi + 1e-6
+        assert abs(controller.session.body.base.measured().yaw_rad) <= np.pi + 1e-6
     controller.step(action="TP", x=float(x), y=float(y), rotation=90)
     controller.step(action="LoadState", name="here")
     assert not np.allclose(controller.session.world.servos.base_pose[:2], (x, y))
@@ -79,7 +79,7 @@ def test_save_load_and_teleport(controller):
 
 def test_a_hand_at_a_door_keeps_the_robot_from_being_teleported(controller):
     controller.reset()
-    x, y = controller.session.body.navigation().free_positions()[0]
+    x, y = controller.session.body.workspace.navigation().free_positions()[0]
     for _ in range(4):
         controller.step(action="RotateLeft", amount=90)  # to see the cabinet
     for call in ({"action": "GoTo", "objectId": "Cabinet_1"}, {"action": "Hold", "arm": "left", "objectId": "Cabinet_1"}):

@@ -73,7 +73,7 @@ def test_fetching_the_mug(session):
         refusal = session.assess(Action.parse("Pick(right, Mug_1)"))
     assert steps(session, "Pick(right, Mug_1)")[0].success
     assert session.goal_status() == (True,) and session.succeeded and session.finished
-    assert session.body.held[Arm.RIGHT] == "Mug_1"
+    assert session.body.hands.held[Arm.RIGHT] == "Mug_1"
     assert session.stats.path_length_m > 0.2 and session.stats.makespan_s > 2.0
     assert 0.0 < session.stats.arm_utilisation <= 0.5
     assert session.observation().history[-1].feedback == "Pick(right, Mug_1) ok"
@@ -86,7 +86,7 @@ def test_restoring_and_repeating_is_bit_equal(session):
     first = steps(session, "Pick(right, Mug_1)", "MoveUp(0.05)")
     physics = session.world.data.qpos.copy(), session.world.data.qvel.copy(), session.stats, session.history
     session.restore(saved)
-    assert session.body.held[Arm.RIGHT] is None and session.stats == saved.stats
+    assert session.body.hands.held[Arm.RIGHT] is None and session.stats == saved.stats
     assert steps(session, "Pick(right, Mug_1)", "MoveUp(0.05)") == first
     assert np.array_equal(session.world.data.qpos, physics[0]) and np.array_equal(session.world.data.qvel, physics[1])
     assert (session.stats, session.history) == physics[2:]

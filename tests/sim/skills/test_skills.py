@@ -9,7 +9,8 @@ from data.interface.steps import Action, PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 from sim.skills.articulate import assess_open_close
-from sim.skills.body import Body
+from sim.skills.body.body import Body
+from sim.skills.body.ready import ready_posture
 from sim.skills.failures import SkillFailure
 from sim.skills.navigation import Stance
 from sim.skills.plan_cache import cached_plan
@@ -63,11 +64,11 @@ def reach(session, text):
 def test_pick_carry_and_place(session):
     start(session)
     assert reach(session, "Pick(right, Mug_1)").success
-    assert session.body.held[Arm.RIGHT] == "Mug_1" and session.world.containment.parents("Mug_1") == ()
+    assert session.body.hands.held[Arm.RIGHT] == "Mug_1" and session.world.containment.parents("Mug_1") == ()
     assert act(session, "Pick(right, Apple_1)")[0].code == "HandOccupied"
     assert act(session, "Pick(left, Mug_1)")[0].code == "AlreadyHeld"
     assert reach(session, "Place(right, CounterTop_1)").success
-    assert session.body.held[Arm.RIGHT] is None and "CounterTop_1" in session.world.containment.parents("Mug_1")
+    assert session.body.hands.held[Arm.RIGHT] is None and "CounterTop_1" in session.world.containment.parents("Mug_1")
 
 
 def test_a_drawer_opens_and_closes(session):
@@ -91,14 +92,14 @@ def close_with_some_arm(session, door):
 
 def stands_as_before(session, before):
     """Whether no movable object was moved by more than 3 cm and both arms are home."""
-    moved = [name for name, place in before.items() if np.linalg.norm(session.body.world_position(name)[:2] - place[:2]) > 0.03]
-    home = all(np.allclose(session.body.commanded_arm(arm), session.body.ready(arm), atol=1e-6) for arm in Arm)
+    moved = [name for name, place in before.items() if np.linalg.norm(session.body.objects.center(name)[:2] - place[:2]) > 0.03]
+    home = all(np.allclose(session.body.arms.commanded(arm), ready_posture(session.body.kit, arm), atol=1e-6) for arm in Arm)
     return not moved and home
 
 
 def places(session, door):
     others = (name for name, thing in session.world.objects.items() if thing.movable and name != door)
-    return {name: session.body.world_position(name) for name in others}
+    return {name: session.body.objects.center(name) for name in others}
 
 
 @pytest.mark.parametrize("door", ["Microwave_1", "Cabinet_1", "Fridge_1"])
@@ -109,7 +110,7 @@ def test_a_door_that_stands_open_is_pushed_shut(session, door):
     outcome = close_with_some_arm(session, door)
     assert outcome.success, outcome
     assert session.world.objects[door].openness < 0.12
-    assert session.body.held == dict.fromkeys(Arm) and stands_as_before(session, before)
+    assert session.body.hands.held == dict.fromkeys(Arm) and stands_as_before(session, before)
     assert act(session, f"Close(left, {door})")[0].code in ("AlreadyInState", "")
 
 
@@ -155,21 +156,21 @@ def test_a_push_is_planned_without_moving_anything_and_always_alike(session):
 def test_a_hypothesis_is_a_value_and_part_of_what_plans_depend_on(session):
     start(session)
     body = session.body
-    state, base, height = body.planning_state(), body.commanded_base(), body.pelvis_height_m
+    state, base, height = body.planning_state(), body.posture.stance(), body.posture.pelvis_height_m
     there = body.assuming(stance=Stance(0.5, 0.5, 0.1))
-    assert there.planning_state() != state and there.commanded_base() == Stance(0.5, 0.5, 0.1)
+    assert there.planning_state() != state and there.posture.stance() == Stance(0.5, 0.5, 0.1)
     lower = there.assuming(pelvis_height_m=0.8)
-    assert (lower.commanded_base(), lower.pelvis_height_m) == (Stance(0.5, 0.5, 0.1), 0.8)
+    assert (lower.posture.stance(), lower.posture.pelvis_height_m) == (Stance(0.5, 0.5, 0.1), 0.8)
     assert body.assuming(diagnose=False).planning_state() != state
-    assert (body.planning_state(), body.commanded_base(), body.pelvis_height_m) == (state, base, height)
+    assert (body.planning_state(), body.posture.stance(), body.posture.pelvis_height_m) == (state, base, height)
 
 
 def test_postures_from_an_assumed_stance_are_those_from_there(session):
     start(session)
     body = session.body
-    q, base = body.commanded_arm(Arm.LEFT), body.commanded_base()
+    q, base = body.arms.commanded(Arm.LEFT), body.posture.stance()
     moved = body.assuming(stance=Stance(base.x + 0.3, base.y - 0.1, base.yaw_rad))
-    assert np.allclose(moved.hand_at(Arm.LEFT, q) - body.hand_at(Arm.LEFT, q), (0.3, -0.1, 0.0))
+    assert np.allclose(moved.ik.hand_at(Arm.LEFT, q) - body.ik.hand_at(Arm.LEFT, q), (0.3, -0.1, 0.0))
 
 
 def test_a_switch_is_pressed(session):
@@ -262,7 +263,7 @@ def test_two_hands_lift_a_box():
     start(made, FreePlay("living_room_1", placements=(ObjectPlacement("Box_1", "CoffeeTable_1"),)))
     assert act(made, "Pick(left, Box_1)")[0].code == "NeedsTwoHands"
     assert reach(made, "Lift(Box_1)").success
-    assert made.body.lifted == "Box_1" and world_metadata(made.world)["inventoryObjects"][0]["arms"] == ["left", "right"]
+    assert made.body.hands.lifted == "Box_1" and world_metadata(made.world)["inventoryObjects"][0]["arms"] == ["left", "right"]
     assert act(made, "ResetArm(left)")[0].code == "BothHandsBusy"
     assert reach(made, "PlaceBoth(Desk_1)").success
     assert "Desk_1" in made.world.containment.parents("Box_1")
@@ -301,7 +302,7 @@ def test_bad_luck_is_acted_out():
     made.draw = lambda action: "broken"  # type: ignore[method-assign]
     outcome = reach(made, "Pick(right, Mug_1)")
     assert (outcome.code, outcome.contingency) == ("Broke", "broken")
-    assert made.world.objects["Mug_1"].is_broken and made.body.held[Arm.RIGHT] is None
+    assert made.world.objects["Mug_1"].is_broken and made.body.hands.held[Arm.RIGHT] is None
     made.close()
 
 
@@ -341,6 +342,6 @@ def test_a_plan_is_made_once_until_something_changes(session):
     session.world.states.set_state("Mug_1", "isDirty", True)
     second = plan(body, action)
     assert second is not first
-    body.command_hand(Arm.LEFT, 0.5)
+    body.hands.command(Arm.LEFT, 0.5)
     assert plan(body, action) is not second
     assert plan(body.assuming(pelvis_height_m=0.8), action) is not second

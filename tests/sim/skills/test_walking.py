@@ -94,13 +94,13 @@ def test_a_hand_that_runs_into_a_wall_ends_the_walk(robot: str) -> None:
     session = Session(robot, image_size=0, all_known=True)
     session.reset(FreePlay("living_room_1", placements=()), 0)
     body, world = session.body, session.world
-    navigation, ahead = body.navigation(), np.array([0.0, -1.0])
+    navigation, ahead = body.workspace.navigation(), np.array([0.0, -1.0])
     to_wall = world.room.bounds[1] + 1.3
     spots = [spot for spot in navigation.free_positions() if abs(spot[1] - to_wall) < 0.03]
     spot = max(spots, key=lambda spot: (navigation.free_travel(spot, spot + ahead) > 0.9, navigation.clearance(spot[None])[0]))
     session.teleport(float(spot[0]), float(spot[1]), -np.pi / 2.0)
     for arm in Arm:
-        body.command_arm(arm, body.vias(arm)[1])  # hands forward
+        body.arms.command(arm, body.ik.vias(arm)[1])  # hands forward
     world.advance(1.5)
     free_m = navigation.free_travel(spot, spot + ahead)
     assert free_m > 0.9, "the disc would fit"
@@ -108,7 +108,7 @@ def test_a_hand_that_runs_into_a_wall_ends_the_walk(robot: str) -> None:
     outcome = feedback.outcomes[0]
     assert outcome.code == "BlockedPath"
     assert outcome.margins["travel_m"] < free_m - 0.03
-    assert np.all(body.pushed() < (0.03, 0.05, 0.35))
+    assert np.all(body.contacts.pushed() < (0.03, 0.05, 0.35))
     _, back = session.step(PlanStep.parse("MoveBack(0.3)"))
     assert back.success, "and the robot can walk away"
 
@@ -118,16 +118,16 @@ def test_an_arm_that_runs_into_a_worktop_ends_the_way_down() -> None:
     session.reset(FreePlay("kitchen_1"), seed=0)
     body, model, data = session.body, session.world.model, session.world.data
     session.teleport(2.0, 1.83, np.deg2rad(135.0))
-    start = body.pelvis_height_m
+    start = body.posture.pelvis_height_m
     _, feedback = session.step(PlanStep.parse("MoveDown(0.3)"))
     outcome = feedback.outcomes[0]
     assert outcome.code == "HeightLimit" and outcome.category is FailureCategory.BODY_ADJUSTMENT
-    assert outcome.margins["height_m"] == pytest.approx(-0.3 - (body.pelvis_height_m - start), abs=1e-4)
-    assert -0.3 < body.pelvis_height_m - start < -0.02, "part of the way"
+    assert outcome.margins["height_m"] == pytest.approx(-0.3 - (body.posture.pelvis_height_m - start), abs=1e-4)
+    assert -0.3 < body.posture.pelvis_height_m - start < -0.02, "part of the way"
     joints = [int(model.joint(name).id) for arm in Arm for name in body.spec.arms[arm.value].joints]
     low, high = model.jnt_range[joints].T
     at = data.qpos[model.jnt_qposadr[joints]]
-    assert np.all((low - 0.02 < at) & (at < high + 0.02)) and body.pushed()[2] < 0.3
+    assert np.all((low - 0.02 < at) & (at < high + 0.02)) and body.contacts.pushed()[2] < 0.3
     _, feedback = session.step(PlanStep.parse("MoveUp(0.05)"))
     assert feedback.outcomes[0].success, "and the robot can rise again"
     session.close()

@@ -8,18 +8,18 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from data.interface.bodies import Arm
+from sim.robots.build_solver import RobotKit
 from sim.scene.objects import MovingPart, ObjectInstance
+from sim.skills.body.joints import JointMap
+from sim.skills.body.posture import Posture
 from sim.world.world import World
-
-if TYPE_CHECKING:
-    from sim.skills.body import Body
 
 __all__ = ["TOUCH_M", "AtDoor", "ClearanceProbe"]
 
@@ -71,21 +71,17 @@ class AtDoor:
 class ClearanceProbe:
     """Collision questions about arm postures."""
 
-    def __init__(self, world: World, body: Body) -> None:
-        self._world = world
-        self._body = body
+    def __init__(self, world: World, joints: JointMap, kit: RobotKit, posture: Posture) -> None:
+        self._world, self._joints, self._kit, self._posture = world, joints, kit, posture
         self._scratch = mujoco.MjData(world.model)
         model = world.model
-        self._geoms = {arm: _limb_geoms(model, body.spec.arms[arm.value].joints[-2]) for arm in Arm}
-        self._arm_adr = {
-            arm: np.array([int(model.joint(n).qposadr[0]) for n in body.spec.arms[arm.value].joints]) for arm in Arm
-        }
-        self._limbs = {arm: sorted(_limb_geoms(model, body.spec.arms[arm.value].joints[0])) for arm in Arm}
+        self._geoms = {arm: _limb_geoms(model, kit.spec.arms[arm.value].joints[-2]) for arm in Arm}
+        self._limbs = {arm: sorted(_limb_geoms(model, kit.spec.arms[arm.value].joints[0])) for arm in Arm}
         self._hands = {arm: np.array([geom for geom in self._limbs[arm] if not _is_forearm(model, geom)]) for arm in Arm}
         self._base_adr = [int(model.joint(name).qposadr[0]) for name in ("base_x", "base_y", "base_yaw")]
-        self._waist_adr = [int(model.joint(name).qposadr[0]) for name in body.spec.waist_joints]
+        self._waist_adr = [int(model.joint(name).qposadr[0]) for name in kit.spec.waist_joints]
         self._bones = {
-            arm: [int(model.body(body.spec.key_bodies[f"{arm.value}_{name}"]).id) for name in ("shoulder", "elbow")]
+            arm: [int(model.body(kit.spec.key_bodies[f"{arm.value}_{name}"]).id) for name in ("shoulder", "elbow")]
             for arm in Arm
         }
         self._height_adr = [int(model.joint(name).qposadr[0]) for name in ("base_z", "base_pitch")]
@@ -100,21 +96,21 @@ class ClearanceProbe:
         ]
         self._groups = {
             arm: tuple(
-                np.array([int(model.geom(name).id) for name in group]) for group in body.spec.arms[arm.value].finger_groups
+                np.array([int(model.geom(name).id) for name in group]) for group in kit.spec.arms[arm.value].finger_groups
             )
             for arm in Arm
         }
 
-    def assuming(self, body: Body) -> ClearanceProbe:
-        """This probe for a body under a hypothesis."""
+    def under(self, posture: Posture) -> ClearanceProbe:
+        """This probe for another posture."""
         there = copy.copy(self)
-        there._body = body
+        there._posture = posture
         return there
 
     def _shape_hand(self, arm: Arm, opening: float) -> None:
         """Puts the fingers of the copy where a hand of that opening has them, coupled joints included."""
         model, qpos = self._world.model, self._scratch.qpos
-        spec = self._body.spec.arms[arm.value]
+        spec = self._kit.spec.arms[arm.value]
         for name, opened, closed in zip(spec.hand_joints, spec.hand_open, spec.hand_closed, strict=True):
             qpos[model.joint(name).qposadr[0]] = closed + opening * (opened - closed)
         for follower, leader, coefficients in self._couplings:
@@ -158,7 +154,7 @@ class ClearanceProbe:
         barred[list(allowed)] = False
         depths: list[float] = []
         for posture in postures:
-            scratch.qpos[self._arm_adr[arm]] = posture
+            scratch.qpos[self._joints.arm_positions[arm]] = posture
             mujoco.mj_kinematics(model, scratch)
             if cargo is not None:
                 cargo.follow(model, scratch)
@@ -173,11 +169,11 @@ class ClearanceProbe:
 
     def _copy_state(self) -> None:
         """The world's state, with the stance and the pelvis height that are assumed."""
-        qpos, body = self._scratch.qpos, self._body
+        qpos, assumed = self._scratch.qpos, self._posture.hypothesis
         qpos[:] = self._world.data.qpos
-        height, stance = body.hypothesis.pelvis_height_m, body.hypothesis.stance
+        height, stance = assumed.pelvis_height_m, assumed.stance
         if height is not None:
-            qpos[self._height_adr] = height, body.crouches.pitch(height)
+            qpos[self._height_adr] = height, self._kit.crouches.pitch(height)
         if stance is not None:
             qpos[self._base_adr] = stance.x, stance.y, stance.yaw_rad
 
@@ -185,12 +181,12 @@ class ClearanceProbe:
         """How an arm, with its fist closed or as it is, stands to a door or drawer at some joint position."""
         world, scratch, model = self._world, self._scratch, self._world.model
         self._copy_state()
-        base = self._body.commanded_base()
+        base = self._posture.stance()
         scratch.qpos[self._base_adr] = base.x, base.y, base.yaw_rad
-        scratch.qpos[self._waist_adr] = self._body.commanded_waist()  # it sways for a while after a walk
+        scratch.qpos[self._waist_adr] = world.data.ctrl[self._joints.waist]  # it sways for a while after a walk
         if fist:
             self._shape_hand(arm, 0.0)
-        scratch.qpos[self._arm_adr[arm]] = posture
+        scratch.qpos[self._joints.arm_positions[arm]] = posture
         scratch.qpos[part.qpos_adr] = position
         mujoco.mj_kinematics(model, scratch)
         limb, panel = self._limbs[arm], np.flatnonzero((model.geom_bodyid == part.body_id) & (model.geom_contype > 0))
@@ -206,7 +202,7 @@ class ClearanceProbe:
         a, b = scratch.contact.geom[: scratch.ncon].T
         counts = (touching[a] != touching[b]) & barred[np.where(touching[a], b, a)]
         depth = max(0.0, float(-np.min(scratch.contact.dist[: scratch.ncon][counts], initial=0.0)))
-        site = int(model.site(self._body.spec.arms[arm.value].grasp_site).id)
+        site = self._joints.grasp_sites[arm]
         bones = np.stack([*scratch.xpos[self._bones[arm]], scratch.site_xpos[site]])
         return AtDoor(gap, depth, bones, scratch.geom_xpos[self._hands[arm]].copy())
 
@@ -217,7 +213,7 @@ class ClearanceProbe:
         thing = None if name is None else world.objects[name]
         if thing is None or not thing.movable or len(thing.held_by) != 1:
             return None
-        site = int(world.model.site(self._body.spec.arms[arm.value].grasp_site).id)
+        site = self._joints.grasp_sites[arm]
         rotation = world.data.site_xmat[site].reshape(3, 3)
         offset = rotation.T @ (world.data.xpos[thing.body_id] - world.data.site_xpos[site])
         turn = rotation.T @ world.data.xmat[thing.body_id].reshape(3, 3)

@@ -1,0 +1,1 @@
+"""The robot as skills see it, split by what each part owns."""

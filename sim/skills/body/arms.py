@@ -1,0 +1,105 @@
+"""Arms and waist: what their servos are told, and motions that keep to speed and acceleration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from data.interface.bodies import Arm
+from sim.robots.build_solver import RobotKit
+from sim.skills.body.clearance import ClearanceProbe
+from sim.skills.body.ik import BothGoal
+from sim.skills.body.joints import JointMap
+from sim.skills.body.ready import ready_posture
+from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.skills.trajectory import Trajectory, plan
+
+__all__ = ["ARM_ACCELERATION_RAD_S2", "ARM_SPEED_RAD_S", "Arms"]
+
+Array = NDArray[np.float64]
+
+#: Bounds of every arm joint at speed 1, rad/s and rad/s². Chosen by hand.
+ARM_SPEED_RAD_S: Final = 3.8
+ARM_ACCELERATION_RAD_S2: Final = 20.0
+
+
+class Arms:
+    """Both arms and the waist of one robot."""
+
+    def __init__(self, data: mujoco.MjData, joints: JointMap, kit: RobotKit, probe: ClearanceProbe) -> None:
+        self._data, self._joints, self._kit, self._probe = data, joints, kit, probe
+
+    def commanded(self, arm: Arm) -> Array:
+        """(A,) commanded arm joints."""
+        return self._data.ctrl[self._joints.arms[arm]].copy()
+
+    def commanded_both(self) -> dict[Arm, Array]:
+        """Commanded joints of both arms."""
+        return {arm: self.commanded(arm) for arm in Arm}
+
+    def commanded_waist(self) -> Array:
+        """Commanded waist joints."""
+        return self._data.ctrl[self._joints.waist].copy()
+
+    def command(self, arm: Arm, q: Array) -> None:
+        """Sets the arm joints' targets."""
+        self._data.ctrl[self._joints.arms[arm]] = q
+
+    def hand_pose(self, arm: Arm) -> tuple[Array, Array]:
+        """Measured world position (3,) and rotation (3, 3) of the grasp site."""
+        site = self._joints.grasp_sites[arm]
+        return self._data.site_xpos[site].copy(), self._data.site_xmat[site].reshape(3, 3).copy()
+
+    def move(self, arm: Arm, waypoints: Sequence[Array], speed: float = 1.0) -> Skill:
+        """Moves the arm from its commanded posture straight to one (A,) waypoint after the other; `speed` scales the bounds."""
+        ids = self._joints.arms[arm]
+        for goal in waypoints:
+            ends = np.stack([self._data.ctrl[ids].copy(), goal])
+            way = plan(ends, ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed * speed)
+            yield from self._follow(way, ids)
+
+    def touch(self, arm: Arm, goal: Array, geoms: NDArray[np.int64], speed: float = 1.0) -> Skill:
+        """Moves the arm straight to (A,) joints, and stops where the hand touches one of some geoms."""
+        ids = self._joints.arms[arm]
+        ends = np.stack([self._data.ctrl[ids].copy(), goal])
+        way = plan(ends, ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed * speed)
+        yield from self._follow(way, ids, lead=False, stop=lambda: self._probe.hand_gap_m(arm, geoms) <= 0.0)
+
+    def _follow(
+        self, way: Trajectory, ids: NDArray[np.int64], lead: bool = True, stop: Callable[[], bool] = lambda: False
+    ) -> Skill:
+        """Sends servos along a trajectory.
+
+        Args:
+            way: of the joints.
+            ids: the servos.
+            lead: whether commands are ahead by what the servos lag behind, so that the joints are where the trajectory says.
+            stop: asked before every tick; ends the motion.
+        """
+        time_s = 0.0
+        while time_s < way.duration_s and not stop():
+            time_s += CONTROL_DT_S
+            target = way.at(time_s)
+            if lead and time_s < way.duration_s:
+                rate = (way.at(time_s + 0.5 * CONTROL_DT_S) - way.at(time_s - 0.5 * CONTROL_DT_S)) / CONTROL_DT_S
+                target = target + self._joints.lag_s[ids] * rate
+            self._data.ctrl[ids] = target
+            yield
+
+    def move_both(self, goals: Sequence[BothGoal], speed: float = 1.0) -> Skill:
+        """Moves both arms and the waist together straight to one goal after the other."""
+        ids = np.concatenate([self._joints.arms[Arm.LEFT], self._joints.arms[Arm.RIGHT], self._joints.waist])
+        for goal in goals:
+            row = np.concatenate([goal.arms[Arm.LEFT], goal.arms[Arm.RIGHT], goal.waist])
+            ends = np.stack([self._data.ctrl[ids].copy(), row])
+            way = plan(ends, ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed**2)
+            yield from self._follow(way, ids)
+
+    def stow_both(self) -> Skill:
+        """Both arms to their ready postures, waist straight."""
+        ready = BothGoal({arm: ready_posture(self._kit, arm) for arm in Arm}, np.zeros(len(self._joints.waist)), 0.0)
+        yield from self.move_both([ready])

@@ -1,0 +1,71 @@
+"""The robot's base and legs: where they are, and what their servos are told."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.robots.build_solver import RobotKit
+from sim.skills.body.joints import JointMap
+from sim.skills.body.posture import Posture
+from sim.skills.footsteps import footsteps
+from sim.skills.gait import leg_motion
+from sim.skills.navigation import Stance
+from sim.skills.runner import CONTROL_DT_S
+from sim.world.world import World
+
+__all__ = ["Base"]
+
+Array = NDArray[np.float64]
+
+
+class Base:
+    """Base and legs of one robot."""
+
+    def __init__(self, world: World, joints: JointMap, kit: RobotKit, posture: Posture) -> None:
+        self._data, self._servos = world.data, world.servos
+        self._joints, self._kit, self._posture = joints, kit, posture
+
+    def measured(self) -> Stance:
+        """Where the base is."""
+        x, y, _, yaw = self._servos.base_pose[:4]
+        return Stance(float(x), float(y), float(yaw))
+
+    def error_m(self) -> float:
+        """Distance between commanded and actual base, the heading weighed with 0.3 m per radian."""
+        x, y, z, yaw = self._data.ctrl[self._joints.base[:4]] - self._servos.base_pose[:4]
+        return float(np.sqrt(x * x + y * y + z * z + (0.3 * yaw) ** 2))
+
+    def command(self, x: float, y: float, yaw_rad: float) -> None:
+        """Sets the base target, world frame."""
+        self._data.ctrl[[self._joints.base[0], self._joints.base[1], self._joints.base[3]]] = (x, y, yaw_rad)
+
+    def command_height(self, pelvis_height_m: float) -> None:
+        """Sets the pelvis height and the legs that go with it."""
+        self._servos.command_height(pelvis_height_m)
+
+    def command_legs(self, joints: Array) -> None:
+        """Sets the leg joints' targets (L,)."""
+        self._data.ctrl[self._joints.legs] = joints
+
+    def walking_targets(self, way: Array) -> tuple[Array, Array]:
+        """Servo targets that take base and feet along a way (T, 3) of x, y and yaw, ahead by what the servos lag behind.
+
+        Returns:
+            (T, 3) base targets and (T, L) leg joints; the last ones are at rest.
+        """
+        height = self._posture.pelvis_height_m
+        crouch = self._kit.crouches.posture(height)
+        soles = self._kit.model.frames(self._posture.root(height), crouch, ("left_sole", "right_sole"))
+        legs = leg_motion(footsteps(self._kit), height, soles[:, :2, 3], way)
+        base_ids = np.array([self._joints.base[0], self._joints.base[1], self._joints.base[3]])
+        return _ahead(way, self._joints.lag_s[base_ids]), _ahead(legs, self._joints.lag_s[self._joints.legs])
+
+
+def _ahead(targets: Array, lag_s: Array) -> Array:
+    """Targets (T, N) of a motion that ends at rest, moved ahead by the servos' lags (N,)."""
+    if len(targets) < 2:
+        return targets
+    rates = np.gradient(targets, CONTROL_DT_S, axis=0)
+    rates[-1] = 0.0
+    return targets + lag_s * rates

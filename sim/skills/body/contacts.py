@@ -1,0 +1,72 @@
+"""Contacts as physics has them now: what the robot runs into, and what objects rest on."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from data.interface.bodies import Arm
+from sim.robots.spec import RobotSpec
+from sim.scene.objects import ObjectInstance
+from sim.skills.body.joints import JointMap
+from sim.world.world import World
+
+__all__ = ["Contacts"]
+
+Array = NDArray[np.float64]
+
+
+class Contacts:
+    """Contacts of one robot and its world."""
+
+    def __init__(self, world: World, joints: JointMap, spec: RobotSpec) -> None:
+        self._world, self._joints = world, joints
+        model = world.model
+        self._hand_joints = np.array([int(model.joint(n).id) for arm in Arm for n in spec.arms[arm.value].hand_joints])
+        sliding = model.jnt_type[self._hand_joints] == int(mujoco.mjtJoint.mjJNT_SLIDE)
+        self._hand_scale = np.where(sliding, 0.2, 1.0)
+        self._mine = np.where(np.isin(model.geom_bodyid, list(world.scene.robot_bodies)), 1, -1)
+
+    def pushed(self) -> Array:
+        """(3,) how much the robot is pushed by what it runs into.
+
+        How deep it presses (m), how far the hands' joints are bent beyond their limits (rad, and m / 0.2 of sliding ones), and
+        how far an arm's joint is from its target (rad), which is what yields first; 0 for the last one while nothing touches.
+        """
+        model, data = self._world.model, self._world.data
+        depth_m, touches = self._pressed()
+        values, scale = data.qpos[model.jnt_qposadr[self._hand_joints]], self._hand_scale
+        low, high = model.jnt_range[self._hand_joints].T
+        bent = float(np.max(np.maximum(low - values, values - high) / scale, initial=0.0))
+        measured, told = self._joints.arm_positions, self._joints.arms
+        off = max(float(np.max(np.abs(data.qpos[measured[arm]] - data.ctrl[told[arm]]))) for arm in Arm)
+        return np.array([depth_m, bent, off if touches else 0.0])
+
+    def rests(self, thing: ObjectInstance) -> bool:
+        """Whether an object touches something that is not part of the robot, from above."""
+        data, mine = self._world.data, set(map(int, thing.geom_ids))
+        owner = self._world.scene.object_of_geom
+        for contact in data.contact[: data.ncon]:
+            a, b = int(contact.geom1), int(contact.geom2)
+            other = b if a in mine else a if b in mine else -1
+            if other >= 0 and (owner[other] >= 0 or other == 0) and abs(float(contact.frame[2])) > 0.6 and contact.dist < 0.0:
+                return True
+        return False
+
+    def _pressed(self) -> tuple[float, bool]:
+        """How deep the robot presses into anything that it does not hold, metres, and whether it touches anything."""
+        data = self._world.data
+        if data.ncon == 0:
+            return 0.0, False
+        owner = self._contact_owner()[data.contact.geom[: data.ncon]]  # (C, 2): 1 robot, 0 held, -1 else
+        touching = np.prod(owner, axis=1) < 0
+        return float(-np.min(data.contact.dist[: data.ncon][touching], initial=0.0)), bool(touching.any())
+
+    def _contact_owner(self) -> NDArray[np.int64]:
+        """(ngeom,) 1 for the robot's geoms, 0 for those of what it holds, -1 for all others."""
+        owner = self._mine.copy()
+        for thing in self._world.objects.values():
+            if thing.held_by:
+                owner[thing.geom_ids] = 0
+        return owner
