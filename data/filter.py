@@ -6,13 +6,12 @@ sitting clips and cannot know the robot.
 
 Paper: data preparation, "filtered with PHC", 11k clips. PHC's test by tracking in physics is left out here
 (`data.tracking` measures a part of it).
-Run `python -m data.filter table FOLDER` for what was dropped, where and why.
+Run `python -m data filter table FOLDER` for what was dropped, where and why.
 """
 
 from __future__ import annotations
 
 import csv
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -136,9 +135,3 @@ def gate(metrics: Metrics, pelvis_height_m: NDArray[np.float64], standing_m: flo
     if low > limits.low_pelvis_s * fps:
         return f"{_PELVIS}{limits.low_pelvis:g} of standing for {low / fps:.1f} s"
     return ""
-
-
-if __name__ == "__main__":
-    from data.filter_table import main
-
-    sys.exit(main(sys.argv[1:]))

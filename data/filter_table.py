@@ -1,4 +1,4 @@
-"""Table of what the filters dropped: `python -m data.filter table FOLDER`.
+"""Table of what the filters dropped: `python -m data filter table FOLDER`.
 
 Of a folder of `clips` shards it counts what the manifest records, from the clips in the list to those kept for each robot. Of
 a folder in HumanML3D's format, which needs no processing, it counts what PHC's list decides about its ids.
@@ -24,7 +24,7 @@ from data.shards import Manifest, ShardError
 
 __all__ = ["list_counts", "main", "manifest_table", "shard_counts"]
 
-_USAGE = "usage: python -m data.filter table FOLDER (clips shards, or a folder in HumanML3D's format)\n"
+_USAGE = "usage: python -m data filter table FOLDER (clips shards, or a folder in HumanML3D's format)\n"
 
 
 def list_counts(ids: Iterable[str]) -> Counter[str]:

@@ -10,12 +10,11 @@ floor, and parts of the robot that come too near to each other, are residuals as
 Shape letters: T frames, J joints. Frames: world, z up, floor at 0.
 
 Paper: data preparation, "retargeted to the robot". Left out: hands' orientation, objects.
-Run `python -m data.retarget report` for a table of metrics.
+Run `python -m data retarget report` for a table of metrics.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -247,9 +246,3 @@ def _level(rotation: Array) -> Array:
         row = int(np.argmax(np.abs(rotation[:, column])))
         snapped[row, column] = np.sign(rotation[row, column])
     return snapped
-
-
-if __name__ == "__main__":
-    from data.retarget_report import main
-
-    sys.exit(main(sys.argv[1:]))

@@ -1,4 +1,4 @@
-"""Table of retargeting metrics: `python -m data.retarget report [clips] [--physics]`.
+"""Table of retargeting metrics: `python -m data retarget report [clips] [--physics]`.
 
 Columns: generated clips per robot, and what `make motions` installed: each OMOMO clip, and the parts of the climbing clips on
 level floor together (weighted by frames). What the project aims at is in the last column. With `--physics` rows are added that
@@ -30,7 +30,7 @@ from sim.robots.spec import available_robots, load_robot
 
 __all__ = ["PHYSICS", "TARGETS", "Column", "main", "measure", "table"]
 
-_USAGE: Final = "usage: python -m data.retarget report [number of generated clips, 72 by default] [--physics]\n"
+_USAGE: Final = "usage: python -m data retarget report [number of generated clips, 72 by default] [--physics]\n"
 
 #: Metric, its heading and what the project aims at.
 TARGETS: Final = {

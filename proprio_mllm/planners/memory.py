@@ -1,6 +1,6 @@
 """The memory of LLM-Planner and RAP: tasks that the expert solved, with its steps and what was seen between them.
 
-    python -m proprio_mllm.planners.memory [demos=outputs/tiny/data/demos] [out=outputs/memory] [limit=100]
+    python -m proprio_mllm.planners.memory_build [demos=outputs/tiny/data/demos] [out=outputs/memory] [limit=100]
 
 reads the demonstrations that `python train.py stage=data` collects in the training tasks, none of which is a task of the
 benchmark (`proprio_mllm.planners.memory_build`). A memory is a folder: `memory.jsonl` has a header line, then one JSON line per
@@ -12,7 +12,6 @@ Paper: baselines LLM-Planner and RAP. RAP's released code takes its memory from 
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +46,7 @@ SCHEMA_VERSION: Final = 1
 #: Names of the files in a memory's folder.
 MEMORY_FILE: Final = "memory.jsonl"
 IMAGES_FILE: Final = "images.safetensors"
-_COMMAND: Final = "python -m proprio_mllm.planners.memory"
+_COMMAND: Final = "python -m proprio_mllm.planners.memory_build"
 
 
 class MemoryFileError(ValueError):
@@ -226,9 +225,3 @@ def _images(path: Path, features: Features) -> NDArray[np.float32]:
     if not path.is_file() or file_hash(path) != features.sha256:
         raise MemoryFileError(f"{path}: missing, or not the file that {MEMORY_FILE} was made with; make it again: {_COMMAND}")
     return load_file(path)["images"].astype(np.float32)
-
-
-if __name__ == "__main__":
-    from proprio_mllm.planners.memory_build import main
-
-    sys.exit(main())

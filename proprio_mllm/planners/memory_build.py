@@ -236,7 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
         config = read_arguments(MemoryConfig, given)
-        memory = build_memory(config, " ".join(["python -m proprio_mllm.planners.memory", *given]))
+        memory = build_memory(config, " ".join(["python -m proprio_mllm.planners.memory_build", *given]))
     except (ConfigError, MemoryFileError, ShardError, SightError) as error:
         sys.stderr.write(f"{error}\n")
         return 2
@@ -247,3 +247,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     facts = f"{found}, {steps} steps, {len(families)} families, {dict(sorted(robots.items()))}"
     sys.stdout.write(f"{config.out}: {facts}\n")
     return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -12,22 +12,19 @@ with n from a to b and p the nearest points. Overlapping pairs have a negative b
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final, Protocol
 
 import coal
 import mujoco
 import numpy as np
 import pink
 import pinocchio as pin
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pink.limits import Limit
 
 from data.interface.bodies import SIDES
 from sim.robots.spec import BodyShape, RobotSpec
-
-if TYPE_CHECKING:
-    from sim.robots.kinematics import RobotModel
 
 __all__ = ["SELF_TOUCH_M", "OwnBody", "SelfLimit", "close_rows", "default_shapes", "moved_by", "solid_on"]
 
@@ -49,6 +46,29 @@ _PARTS: Final = (*SIDES, "trunk", "legs")
 _FAR_M: Final = 1.0
 
 
+class PosableRobot(Protocol):
+    """What the shapes have to know of a robot's kinematics."""
+
+    spec: RobotSpec
+    model: pin.Model
+
+    def posture(self, values: Mapping[str, float] | None = None) -> Array:
+        """(J,) joints at rest."""
+        ...
+
+    def arm_posture(self, q: ArrayLike, kind: str) -> Array:
+        """(J,) joints with the arms in a named posture."""
+        ...
+
+    def configuration(self, root_pose: ArrayLike, q: ArrayLike) -> Array:
+        """Pinocchio's configuration of a pelvis pose and joints."""
+        ...
+
+    def frame_id(self, name: str) -> int:
+        """Pinocchio's frame of a body or site."""
+        ...
+
+
 class OwnBody:
     """The shapes of a robot on its kinematics.
 
@@ -57,7 +77,7 @@ class OwnBody:
         parts: per shape what it belongs to: `left` or `right` (arm), `legs`, or `trunk`, which is all the rest.
     """
 
-    def __init__(self, robot: RobotModel) -> None:
+    def __init__(self, robot: PosableRobot) -> None:
         self._robot = robot
         spec, model = robot.spec, robot.model
         self.geometry = pin.GeometryModel()
@@ -201,7 +221,7 @@ def close_rows(results: Sequence[Any], data: pin.Data, moves: Array, near_m: flo
     return (np.array(lines) @ data.J) * moves[close], gaps[close]
 
 
-def solid_on(robot: RobotModel, shape: BodyShape, name: str) -> pin.GeometryObject:
+def solid_on(robot: PosableRobot, shape: BodyShape, name: str) -> pin.GeometryObject:
     """A shape as Pinocchio's geometry on the joint that moves its body."""
     index = robot.frame_id(shape.body)
     frame = robot.model.frames[index]

@@ -63,7 +63,7 @@ def test_table_of_shards(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tables"]) == 2
-    assert "usage: python -m data.filter table" in capsys.readouterr().err
+    assert "usage: python -m data filter table" in capsys.readouterr().err
     assert main(["table", str(tmp_path)]) == 1
     assert "new_joints" in capsys.readouterr().err
     with pytest.raises(ShardError, match="'views' without counts"):
