@@ -33,7 +33,8 @@ class Action:
         name: a key of `ACTIONS`.
         arm: the arm that acts; required for arm actions, None for all others.
         object_id: target object, or the receptacle for Place and PlaceBoth.
-        amount: metres or degrees, see `ActionSpec.amount_unit`; None takes the action's default.
+        amount: metres or degrees, see `ActionSpec.amount`; None takes the action's default. GoTo's is the distance between
+            pelvis and object.
         bearing_deg: GoTo only, the object's bearing in the heading frame after arrival, positive to the left.
 
     Raises:
@@ -59,18 +60,25 @@ class Action:
         if self.object_id is not None and not _OBJECT_ID.match(self.object_id):
             raise ActionError(f"{self.name}: object id {self.object_id!r} is not of the form Type_1")
         if self.amount is not None:
-            low, high = spec.amount_range
-            if spec.amount_unit is None:
+            if spec.amount is None:
                 raise ActionError(f"{self.name} takes no amount, got {self.amount!r}")
+            low, high = spec.amount.low, spec.amount.high
             if not low <= self.amount <= high:  # also refuses NaN
-                raise ActionError(f"{self.name}: amount {self.amount!r} outside [{low:g}, {high:g}] {spec.amount_unit}")
-        if self.bearing_deg is not None and (self.name != "GoTo" or not -180.0 <= self.bearing_deg <= 180.0):
+                raise ActionError(f"{self.name}: amount {self.amount!r} outside [{low:g}, {high:g}] {spec.amount.unit}")
+        if self.bearing_deg is not None and (len(spec.amounts) < 2 or not -180.0 <= self.bearing_deg <= 180.0):
             raise ActionError(f"{self.name}: bearing {self.bearing_deg!r} is for GoTo only, within [-180, 180] deg")
 
     @property
     def spec(self) -> ActionSpec:
-        """Signature of this action."""
+        """Its row of the table of actions."""
         return ACTIONS[self.name]
+
+    @property
+    def given_amount(self) -> float:
+        """Its amount or the default, metres or degrees; 0 for actions without one."""
+        if self.amount is not None:
+            return self.amount
+        return 0.0 if self.spec.amount is None else self.spec.amount.default or 0.0
 
     def to_text(self) -> str:
         """The action in the grammar, for example `Pick(left, Mug_1)`, `MoveDown(0.2)`, `GoTo(Fridge_1, 0.6, 15)`."""
@@ -113,12 +121,12 @@ class Action:
             if not parts:
                 raise ActionError(f"{name} needs an object id, got {text[:80]!r}")
             object_id = parts.pop(0)
-        limit = 2 if name == "GoTo" else int(spec.amount_unit is not None)
+        limit = len(spec.amounts)
         if len(parts) > limit:
             raise ActionError(f"{name}: superfluous arguments {parts[limit:]} in {text[:80]!r}")
         numbers: list[float | None] = []
         for part in parts:
-            if part == "auto" and name == "GoTo":
+            if part == "auto" and limit == 2:
                 numbers.append(None)
                 continue
             try:

@@ -64,7 +64,7 @@ class RandomPlanner:
             names = (known or visible) if name == "GoTo" else (visible or known)
             target = str(self._rng.choice(names))
         amount: float | None = None
-        if spec.amount_unit is not None and name != "GoTo":
-            low, high = spec.amount_range
-            amount = round(float(self._rng.uniform(low, min(high, 1.0) if spec.amount_unit == "m" else high)), 2)
+        if len(spec.amounts) == 1:
+            low, high = spec.amounts[0].low, spec.amounts[0].high
+            amount = round(float(self._rng.uniform(low, min(high, 1.0) if spec.amounts[0].unit == "m" else high)), 2)
         return Action(name, arm=arm if spec.kind is ActionKind.ARM else None, object_id=target, amount=amount)

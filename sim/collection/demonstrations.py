@@ -196,8 +196,9 @@ def _perturbation(kind: str, step: PlanStep, known: Sequence[str], rng: np.rando
     head = step.actions[0]
     if kind == "amount":
         assert head.amount is not None
-        low, high = head.spec.amount_range
-        unit = 5.0 if head.spec.amount_unit == "deg" else 0.05
+        assert head.spec.amount is not None
+        low, high = head.spec.amount.low, head.spec.amount.high
+        unit = 5.0 if head.spec.amount.unit == "deg" else 0.05
         factor = float(rng.choice((0.4, 0.7, 1.5, 2.0)))
         amount = float(np.clip(round(factor * head.amount / unit) * unit, max(low, unit), high))
         return Action(head.name, object_id=head.object_id, amount=round(amount, 2), bearing_deg=head.bearing_deg)

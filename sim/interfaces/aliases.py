@@ -112,7 +112,7 @@ def to_action(name: str, arguments: Mapping[str, Any]) -> Action:
         keys = keys or ("objectId", "objectID")
         object_id = next((str(arguments[key]) for key in keys if arguments.get(key)), None)
     amount: float | None = None
-    if spec.amount_unit is not None:
+    if spec.amount is not None:
         if "magnitude" in arguments:
             amount = number(name, "magnitude", arguments["magnitude"]) * _MAGNITUDE_UNIT.get(target, 1.0)
         for key in ("moveMagnitude", "degrees", "amount"):

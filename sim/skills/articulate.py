@@ -22,7 +22,7 @@ from data.interface.failures import FailureCode
 from data.interface.steps import Action
 from sim.scene.objects import MovingPart, ObjectInstance
 from sim.skills.body.body import Body
-from sim.skills.checks import check_open_close, check_toggle
+from sim.skills.facts import require
 from sim.skills.failures import SkillFailure
 from sim.skills.lids import closed_on, led_on, plan_lead, plan_tab
 from sim.skills.locomotion import sweep
@@ -132,7 +132,7 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
     """
     assert action.arm is not None and action.object_id is not None
     arm, thing, opening = action.arm, body.thing(action.object_id), action.name == "Open"
-    check_open_close(body, arm, thing, opening)
+    require(body, action)
     part = thing.moving[0]
     handle = body.world.data.site_xpos[part.handle_site].copy()
     low, high = part.range
@@ -375,7 +375,7 @@ def assess_toggle(body: Body, action: Action) -> Reach:
     """
     assert action.arm is not None and action.object_id is not None
     arm, thing = action.arm, body.thing(action.object_id)
-    check_toggle(body, arm, thing, action.name == "ToggleOn")
+    require(body, action)
     return plan_press(body, arm, body.world.poses.toggle_point(thing.object_id), (thing.object_id,))
 
 

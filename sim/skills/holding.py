@@ -11,7 +11,7 @@ from data.interface.failures import FailureCode
 from data.interface.steps import Action
 from sim.skills.articulate import plan_handle
 from sim.skills.body.body import Body
-from sim.skills.checks import check_hold
+from sim.skills.facts import require
 from sim.skills.failures import SkillFailure
 from sim.skills.grasps import Grasp
 from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, grip, plan_pick, retreat, stow
@@ -31,8 +31,8 @@ def assess_hold(body: Body, action: Action) -> tuple[Grasp | None, Reach]:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
+    require(body, action)
     thing = body.thing(action.object_id)
-    check_hold(body, action.arm, thing)
     return plan_pick(body, action.arm, thing) if thing.movable else (None, plan_handle(body, action.arm, thing))
 
 
@@ -77,10 +77,9 @@ def release(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     del outcome_draw
     arm = action.arm
     assert arm is not None
-    name = body.hands.held[arm] if body.hands.lifted is None else body.hands.lifted
-    if name is None:
-        raise SkillFailure(FailureCode.HAND_EMPTY)
-    thing = body.thing(name)
+    require(body, action)
+    thing = body.thing(body.hands.lifted or body.hands.held[arm] or "")
+    name = thing.object_id
     body.world.grasps.detach(arm.value)
     yield from body.hands.move(arm, 1.0)
     position, hand = body.arms.hand_pose(arm)

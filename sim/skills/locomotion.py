@@ -208,7 +208,7 @@ def move(body: Body, action: Action) -> Skill:
     Raises:
         SkillFailure: BlockedPath with the metres that were walked.
     """
-    amount = action.amount if action.amount is not None else float(action.spec.amount_default or 0.0)
+    amount = action.given_amount
     start = body.posture.stance()
     angle = start.yaw_rad + _DIRECTIONS[action.name]
     goal = start.position + amount * np.array([np.cos(angle), np.sin(angle)])
@@ -228,7 +228,7 @@ def rotate(body: Body, action: Action) -> Skill:
     Raises:
         SkillFailure: BlockedPath when a hand runs into something.
     """
-    degrees = action.amount if action.amount is not None else float(action.spec.amount_default or 0.0)
+    degrees = action.given_amount
     sign = 1.0 if action.name == "RotateLeft" else -1.0
     yield from _turn_by(body, sign * np.deg2rad(degrees))
     yield from _settle(body)
@@ -240,7 +240,7 @@ def change_height(body: Body, action: Action) -> Skill:
     Raises:
         SkillFailure: HeightLimit, with the part of the change that was not made, when they could do less than asked.
     """
-    amount = action.amount if action.amount is not None else float(action.spec.amount_default or 0.0)
+    amount = action.given_amount
     start = body.posture.pelvis_height_m
     wanted = start + (amount if action.name == "MoveUp" else -amount)
     low, high = body.spec.pelvis_height_range_m

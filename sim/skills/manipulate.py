@@ -21,7 +21,7 @@ from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
 from sim.skills.body.ready import carrying_posture, ready_posture
-from sim.skills.checks import check_pick, check_place
+from sim.skills.facts import require
 from sim.skills.failures import SkillFailure
 from sim.skills.grasps import Grasp, grasp_candidates
 from sim.skills.plan_cache import cached_plan
@@ -418,8 +418,8 @@ def assess_pick(body: Body, action: Action) -> tuple[Grasp, Reach]:
         SkillFailure: as Pick would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
+    require(body, action)
     thing = body.thing(action.object_id)
-    check_pick(body, action.arm, thing)
     return plan_pick(body, action.arm, thing)
 
 
@@ -431,8 +431,9 @@ def assess_place(body: Body, action: Action) -> tuple[Array, Reach, Array]:
         SkillFailure: as Place would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    receptacle = body.thing(action.object_id)
-    return plan_place(body, action.arm, check_place(body, action.arm, receptacle), receptacle)
+    require(body, action)
+    held = body.thing(body.hands.held[action.arm] or "")
+    return plan_place(body, action.arm, held, body.thing(action.object_id))
 
 
 def reset_arm(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
@@ -443,10 +444,7 @@ def reset_arm(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """
     del outcome_draw
     assert action.arm is not None
-    if body.hands.lifted is not None:
-        raise SkillFailure(FailureCode.BOTH_HANDS_BUSY)
-    if body.hands.at_furniture(action.arm):
-        raise SkillFailure(FailureCode.IN_USE)
+    require(body, action)
     if body.hands.held[action.arm] is None:
         yield from body.hands.move(action.arm, 1.0)
     yield from stow(body, action.arm)

@@ -19,7 +19,7 @@ from data.interface.failures import FailureCode
 from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
-from sim.skills.checks import check_fill, check_pour
+from sim.skills.facts import FULL_SHARE, WorldFacts, require
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import OutcomeDraw, nudge, plan_bring, stow
 from sim.skills.plan_cache import cached_plan
@@ -57,8 +57,9 @@ def assess_pour(body: Body, action: Action) -> tuple[Reach, float]:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
+    require(body, action)
     arm, target = action.arm, body.thing(action.object_id)
-    vessel = check_pour(body, arm, target)
+    vessel = body.thing(body.hands.held[arm] or "")
     top, radius = _opening(body, target)
     spots = _beside(body, arm, vessel, top, radius)
     names = (vessel.object_id, target.object_id)
@@ -141,7 +142,7 @@ def pour(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     if outcome != "success":
         body.world.liquids.spill(vessel)
     before, had = target.state.fillLitres, vessel.state.fillLitres
-    full = 0.999 * target.type.volume_l
+    full = FULL_SHARE * target.type.volume_l
     pouring = body.arms.move(arm, [tilted], speed=0.35)
     for _ in range(int(_LONGEST_S / CONTROL_DT_S)):
         next(pouring, None)  # then the arm stays as it is commanded
@@ -158,6 +159,11 @@ def pour(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
         raise SkillFailure(FailureCode.POUR_MISSED, {"missed_l": poured - came})
 
 
+def _outlet(body: Body, object_id: str) -> ObjectInstance:
+    """The tap or machine that a liquid comes out of there."""
+    return body.thing(WorldFacts(body).outlet(object_id) or "")
+
+
 @cached_plan
 def assess_fill(body: Body, action: Action) -> Reach:
     """What Fill would do.
@@ -166,8 +172,8 @@ def assess_fill(body: Body, action: Action) -> Reach:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    source = body.thing(action.object_id)
-    vessel, outlet = check_fill(body, action.arm, source)
+    require(body, action)
+    vessel, outlet = body.thing(body.hands.held[action.arm] or ""), _outlet(body, action.object_id)
     point = body.world.liquids.spout(outlet)
     assert point is not None
     height = float(vessel.local_max[2] - vessel.local_min[2])
@@ -188,12 +194,12 @@ def fill(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     reach = assess_fill(body, action)
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    vessel, outlet = check_fill(body, arm, body.thing(action.object_id))
+    vessel, outlet = body.thing(body.hands.held[arm] or ""), _outlet(body, action.object_id)
     outcome = outcome_draw(action)
     before = vessel.state.fillLitres
     yield from body.arms.move(arm, [*reach.way, reach.before])
     yield from body.arms.move(arm, [reach.at], speed=0.6)
-    full = 0.999 * vessel.type.volume_l
+    full = FULL_SHARE * vessel.type.volume_l
     for _ in range(_CORRECTIONS):
         yield from wait(0.1)
         point, (top, _) = body.world.liquids.spout(outlet), _opening(body, vessel)

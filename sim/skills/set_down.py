@@ -23,7 +23,7 @@ from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
 from sim.skills.body.clearance import TOUCH_M
 from sim.skills.body.ik import BothGoal
-from sim.skills.checks import check_place_both
+from sim.skills.facts import require
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import OutcomeDraw, upright
 from sim.skills.plan_cache import cached_plan
@@ -75,8 +75,8 @@ def assess_place_both(body: Body, action: Action) -> BothPlacement:
         SkillFailure: as PlaceBoth would before it moves.
     """
     assert action.object_id is not None
-    receptacle = body.thing(action.object_id)
-    thing = check_place_both(body, receptacle)
+    require(body, action)
+    receptacle, thing = body.thing(action.object_id), body.thing(body.hands.lifted or "")
     spots = body.workspace.free_spots(thing, receptacle, None)
     if not spots:
         raise SkillFailure(FailureCode.RECEPTACLE_FULL)

@@ -19,7 +19,7 @@ from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.articulate import plan_press
 from sim.skills.body.body import Body
-from sim.skills.checks import check_clean, check_slice, check_use_up
+from sim.skills.facts import require
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, nudge, plan_bring, stow
 from sim.skills.plan_cache import cached_plan
@@ -55,8 +55,8 @@ def assess_slice(body: Body, action: Action) -> Reach:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    thing = body.thing(action.object_id)
-    tool = check_slice(body, action.arm, thing)
+    require(body, action)
+    thing, tool = body.thing(action.object_id), body.thing(body.hands.held[action.arm] or "")
     names = (tool.object_id, thing.object_id, *body.world.containment.parents(thing.object_id)[:1])
     return plan_bring(body, action.arm, tool, [_top(body, thing)], names, point=_blade(tool), above_m=0.002)[1]
 
@@ -69,8 +69,8 @@ def assess_clean(body: Body, action: Action) -> Reach:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    thing = body.thing(action.object_id)
-    tool = check_clean(body, action.arm, thing)
+    require(body, action)
+    thing, tool = body.thing(action.object_id), body.thing(body.hands.held[action.arm] or "")
     spots = [np.asarray(puddle.position) for puddle in body.world.liquids.puddles if puddle.surface == thing.object_id]
     if not spots:
         spots = [_top(body, thing)] if thing.movable else body.workspace.free_spots(tool, thing, action.arm)
@@ -87,8 +87,8 @@ def assess_use_up(body: Body, action: Action) -> Reach:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
+    require(body, action)
     thing = body.thing(action.object_id)
-    check_use_up(body, action.arm, thing)
     return plan_press(body, action.arm, _top(body, thing) - (0.0, 0.0, 0.01), (thing.object_id,))
 
 

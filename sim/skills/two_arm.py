@@ -19,7 +19,7 @@ from data.interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
 from sim.skills.body.ik import BothGoal
-from sim.skills.checks import check_lift
+from sim.skills.facts import require
 from sim.skills.failures import SkillFailure
 from sim.skills.grasps import solid_box
 from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw
@@ -97,8 +97,8 @@ def assess_lift(body: Body, action: Action) -> BothReach:
         SkillFailure: as Lift would before it moves.
     """
     assert action.object_id is not None
+    require(body, action)
     thing = body.thing(action.object_id)
-    check_lift(body, thing)
     sides = _sides(body, thing)
     name = (thing.object_id,)
 

@@ -114,8 +114,8 @@ def _actions() -> list[Row]:
             "kind": spec.kind.value,
             "takes_object": spec.takes_object,
             "amount": None
-            if spec.amount_unit is None
-            else {"unit": spec.amount_unit, "range": list(spec.amount_range), "default": spec.amount_default},
+            if spec.amount is None
+            else {"unit": spec.amount.unit, "range": [spec.amount.low, spec.amount.high], "default": spec.amount.default},
             "aliases": aliases.get(spec.name, []),
         }
         for spec in ACTIONS.values()

@@ -151,8 +151,8 @@ def _call(rng: np.random.Generator, objects: Sequence[str], focus: str) -> dict[
     call: dict[str, Any] = {"action": spec.name}
     if spec.takes_object:
         call["objectId"] = focus if rng.random() < 0.7 else objects[int(rng.integers(len(objects)))]
-    if spec.amount_unit is not None and rng.random() < 0.7:
-        low, high = spec.amount_range
+    if spec.amount is not None and rng.random() < 0.7:
+        low, high = spec.amount.low, spec.amount.high
         call["amount"] = float(rng.uniform(low, high if rng.random() < 0.3 else min(high, low + 0.25 * (high - low))))
     return call
 

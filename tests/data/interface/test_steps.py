@@ -62,8 +62,8 @@ def test_action_refuses_an_arm_where_none_belongs() -> None:
 
 def test_every_action_has_a_default_or_no_amount() -> None:
     for spec in ACTIONS.values():
-        if spec.amount_unit is not None and spec.amount_default is not None:
-            assert spec.amount_range[0] <= spec.amount_default <= spec.amount_range[1]
+        for amount in spec.amounts:
+            assert amount.default is None or amount.low <= amount.default <= amount.high
 
 
 def test_feedback_text_carries_codes_and_no_margins() -> None:
