@@ -11,11 +11,12 @@ import numpy as np
 from pydantic import BaseModel
 
 from data.interface.feedback import Feedback
+from data.interface.manual import action_manual
 from data.interface.observation import Observation
 from proprio_mllm.backends.protocol import Backend
 from proprio_mllm.planners.chat.asking import Asker
-from proprio_mllm.planners.chat.manual import action_manual, role
 from proprio_mllm.planners.chat.options import ChatOptions
+from proprio_mllm.planners.chat.role import role
 from proprio_mllm.planners.chat.view import encoded
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 

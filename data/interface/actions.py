@@ -18,7 +18,17 @@ from data.interface.facts import Call, Facts, Situation
 from data.interface.failures import FailureCode
 from data.interface.requirements import Requirement, need, where
 
-__all__ = ["ACTIONS", "ActionKind", "ActionSpec", "Amount", "Refusal", "bringing_about", "exclude_each_other", "first_refusal"]
+__all__ = [
+    "ACTIONS",
+    "ActionKind",
+    "ActionSpec",
+    "Amount",
+    "Refusal",
+    "bringing_about",
+    "exclude_each_other",
+    "first_refusal",
+    "given_amount",
+]
 
 
 class ActionKind(StrEnum):
@@ -359,6 +369,14 @@ def first_refusal(call: Call, facts: Facts) -> Refusal | None:
         if not one.holds(situation):
             return Refusal(one.code, {} if one.margin is None else {one.margin[0]: one.margin[1](situation)})
     return None
+
+
+def given_amount(call: Call) -> float:
+    """The amount of an action or its default, metres or degrees; 0 for actions without one."""
+    if call.amount is not None:
+        return call.amount
+    amount = ACTIONS[call.name].amount
+    return 0.0 if amount is None else amount.default or 0.0
 
 
 def exclude_each_other(first: Call, second: Call) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from data.interface.actions import ACTIONS, ActionKind, ActionSpec
+from data.interface.actions import ACTIONS, ActionKind, ActionSpec, given_amount
 from data.interface.bodies import Arm
 
 __all__ = ["Action", "ActionError", "PlanStep"]
@@ -76,9 +76,7 @@ class Action:
     @property
     def given_amount(self) -> float:
         """Its amount or the default, metres or degrees; 0 for actions without one."""
-        if self.amount is not None:
-            return self.amount
-        return 0.0 if self.spec.amount is None else self.spec.amount.default or 0.0
+        return given_amount(self)
 
     def to_text(self) -> str:
         """The action in the grammar, for example `Pick(left, Mug_1)`, `MoveDown(0.2)`, `GoTo(Fridge_1, 0.6, 15)`."""

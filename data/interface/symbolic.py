@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from data.interface.actions import ACTIONS
+from data.interface.actions import ACTIONS, given_amount
 from data.interface.bodies import Arm
 from data.interface.effects import Become, Condition, Effect, Grasp, HoldOpen, LetGo, PutDown, Rise, Walk
 from data.interface.facts import Call
@@ -29,6 +29,10 @@ class Event:
     def ok(self) -> bool:
         """Whether the action succeeded."""
         return self.code == "ok"
+
+    def about(self, verb: str, target: str | None) -> bool:
+        """Whether it was this verb on this object, with either arm."""
+        return self.action.name == verb and self.action.object_id == target
 
 
 def events_of(history: Sequence[HistoryItem]) -> Iterator[tuple[Event, ...]]:
@@ -125,8 +129,7 @@ class SymbolicState:
             case Walk(to_target):
                 self.here = target if to_target else None
             case Rise(sign):
-                amount = ACTIONS[call.name].amounts[0]
-                self.rise_m += sign * (call.amount if call.amount is not None else amount.default or 0.0)
+                self.rise_m += sign * given_amount(call)
             case _:
                 pass
 

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from data.interface.actions import ActionKind
-from data.interface.failures import FailureCategory
+from data.interface.failures import INVALID_OUTPUT, FailureCategory, FailureCode
 from data.interface.steps import Action
 
 if TYPE_CHECKING:
@@ -33,9 +33,8 @@ if TYPE_CHECKING:
 __all__ = ["INVALID_OUTPUT", "Deciding", "attribute", "deciding_failure", "unmet_objects"]
 
 #: Feedback code of a reply outside the action grammar.
-INVALID_OUTPUT: Final = "InvalidOutput"
 #: Codes with which the hand has lost what it was to put down.
-_LOST: Final = ("Dropped", "PlaceMissed", "Slipped", "Broke")
+_LOST: Final = (FailureCode.DROPPED, FailureCode.PLACE_MISSED, FailureCode.SLIPPED, FailureCode.BROKE)
 
 
 @dataclass(frozen=True, slots=True)

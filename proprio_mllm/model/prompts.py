@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
+from data.interface.manual import action_manual, code_manual
 from data.interface.observation import HistoryItem
 from proprio_mllm.model.chat import Message
 from proprio_mllm.model.vocabulary import motion_text
@@ -37,11 +38,8 @@ _SYSTEM: dict[str, dict[Style, str]] = {
     "plan": {
         "terse": "plan",
         "full": (
-            "You plan for a dual-arm humanoid household robot. Reply with the next step only: one action, or two arm actions "
-            "joined by ' & '. Arm actions: Pick, Place, Open, Close, ToggleOn, ToggleOff (arm, object), ResetArm(arm). Two-arm "
-            "actions: Lift, PlaceBoth (object). Body actions: GoTo(object, metres), MoveAhead, MoveBack, MoveLeft, MoveRight, "
-            "MoveUp, MoveDown (metres), RotateLeft, RotateRight (degrees). Done() ends the task. "
-            "Example: Pick(left, Mug_1) & Pick(right, Plate_1)"
+            "You plan for a dual-arm humanoid household robot. Reply with the next step only.\n"
+            f"{action_manual()}\n{code_manual()}"
         ),
     },
     "look": {"terse": "look", "full": "You answer questions about what the robot sees, relative to its own body."},

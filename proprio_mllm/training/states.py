@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
+from data.interface.bodies import Arm
+from data.interface.effects import Condition
 from data.interface.observation import HistoryItem
-from data.interface.steps import Action, ActionError
+from data.interface.symbolic import SymbolicState, events_of
 
 __all__ = ["asked_relation", "history_of", "open_hands", "states_from_log"]
 
-_SWITCHES: Final = {"Open": "open", "Close": "closed", "ToggleOn": "switched on", "ToggleOff": "switched off", "Lift": "lifted"}
-_OPPOSITE: Final = {"open": "closed", "closed": "open", "switched on": "switched off", "switched off": "switched on"}
+#: States that are asked about, by the words for being in them and for not.
+_WORDS: Final[Mapping[Condition, tuple[str, str]]] = {
+    Condition.OPEN: ("open", "closed"),
+    Condition.ON: ("switched on", "switched off"),
+    Condition.SLICED: ("sliced", ""),
+    Condition.DIRTY: ("", "clean"),
+    Condition.USED_UP: ("used up", ""),
+    Condition.FILLED: ("filled", ""),
+}
 
 
 def history_of(row: Mapping[str, Any]) -> list[HistoryItem]:
@@ -28,69 +37,35 @@ def asked_relation(states: Mapping[str, Sequence[str]], rng: np.random.Generator
     return names[int(rng.integers(len(names)))]
 
 
-def _successes(history: Sequence[HistoryItem]) -> Iterator[Action]:
-    """The actions of a log that were carried out, in order."""
-    for item in history:
-        for part in item.feedback.split(";"):
-            text, _, result = part.strip().rpartition(" ")
-            if result != "ok":
-                continue
-            try:
-                yield Action.parse(text)
-            except ActionError:
-                continue
+def _state_after(history: Sequence[HistoryItem]) -> SymbolicState:
+    state = SymbolicState()
+    for events in events_of(history):
+        for event in events:
+            if event.ok:
+                state.succeed(event.action)
+    return state
 
 
 def open_hands(history: Sequence[HistoryItem]) -> tuple[bool, bool]:
     """Whether the left and the right hand are empty after a log that begins with empty hands."""
-    empty = {"left": True, "right": True}
-    for action in _successes(history):
-        if action.name in ("Pick", "Place") and action.arm is not None:
-            empty[action.arm.value] = action.name == "Place"
-        elif action.name in ("Lift", "PlaceBoth"):
-            empty = dict.fromkeys(empty, action.name == "PlaceBoth")
-    return empty["left"], empty["right"]
+    free = _state_after(history).free_arms()
+    return Arm.LEFT in free, Arm.RIGHT in free
 
 
 def states_from_log(history: Sequence[HistoryItem]) -> dict[str, tuple[str, ...]]:
     """Objects in each relation according to the successful actions of a log.
 
-    Relations: `held`, `lifted`, `open`, `closed`, `switched on`, `switched off`, and `on R` for receptacles R.
+    Relations: `held`, `lifted`, `open`, `closed`, `switched on`, `switched off`, `sliced`, `clean`, `used up`, `filled`, and
+    `on R` for receptacles R.
     """
-    hands: dict[str, str] = {}
-    lifted = ""
-    found: dict[str, list[str]] = {name: [] for name in _SWITCHES.values()}
-
-    def move(thing: str, place: str | None) -> None:
-        for name, things in found.items():
-            if name.startswith("on ") and thing in things:
-                things.remove(thing)
-        if place is not None:
-            found.setdefault(f"on {place}", []).append(thing)
-
-    for action in _successes(history):
-        thing = action.object_id or ""
-        if action.name == "Pick" and action.arm is not None:
-            hands[action.arm.value] = thing
-            move(thing, None)
-        elif action.name == "Place" and action.arm is not None:
-            held = hands.pop(action.arm.value, None)
-            if held:
-                move(held, thing)
-        elif action.name == "PlaceBoth":
-            if lifted:
-                move(lifted, thing)
-                found["lifted"] = []
-            lifted = ""
-        elif action.name in _SWITCHES:
-            relation = _SWITCHES[action.name]
-            if action.name == "Lift":
-                lifted = thing
-                move(thing, None)
-            opposite = found.get(_OPPOSITE.get(relation, ""), [])
-            if thing in opposite:
-                opposite.remove(thing)
-            if thing not in found[relation]:
-                found[relation].append(thing)
-    found["held"] = list(hands.values())
+    state = _state_after(history)
+    found: dict[str, list[str]] = {word: [] for words in _WORDS.values() for word in words if word}
+    for condition, (yes, no) in _WORDS.items():
+        for thing, value in state.conditions[condition].items():
+            if word := yes if value else no:
+                found[word].append(thing)
+    for thing, place in state.at.items():
+        found.setdefault(f"on {place}", []).append(thing)
+    found["lifted"] = [] if state.lifted is None else [state.lifted]
+    found["held"] = [item for item in state.held.values() if item is not None]
     return {name: tuple(things) for name, things in found.items()}

@@ -23,7 +23,7 @@ import numpy as np
 from configs.schema.collect import CollectConfig
 from data.interface.actions import ActionKind
 from data.interface.bodies import Arm
-from data.interface.failures import FailureCode
+from data.interface.failures import INVALID_OUTPUT, FailureCode
 from data.interface.observation import HistoryItem
 from data.interface.steps import Action, PlanStep
 from sim.collection.students import accepted
@@ -208,7 +208,7 @@ class _Episode:
     def take(self, step: PlanStep | None) -> None:
         """Carries a step out; None is a reply that names none."""
         if step is None:
-            self._history.append({"step": "", "feedback": "InvalidOutput"})
+            self._history.append({"step": "", "feedback": INVALID_OUTPUT})
             return
         outcomes = [(action, self.world.act(action)) for action in step.actions]
         self.exercise.codes |= {str(code) for _, code in outcomes}

@@ -13,8 +13,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from data.interface.actions import ACTIONS, ActionKind
+from data.interface.actions import ACTIONS, ActionKind, bringing_about
 from data.interface.bodies import Arm
+from data.interface.effects import Condition
 from data.interface.steps import Action
 from sim.tasks.predicates import Predicate
 
@@ -22,7 +23,12 @@ __all__ = ["Facts", "Job", "pending_leaves", "plan_jobs"]
 
 _NEGATION: Final = {"open": "closed", "closed": "open", "toggled_on": "toggled_off", "toggled_off": "toggled_on"}
 #: What a hand has to hold to bring a state about, and the action that does.
-_TOOL_WORK: Final = {"sliced": ("cutter", "Slice"), "clean": ("wiper", "Clean")}
+_TOOL_WORK: Final = {
+    kind: (spec.tool, spec.name)
+    for kind, state in (("sliced", (Condition.SLICED, True)), ("clean", (Condition.DIRTY, False)))
+    for spec in bringing_about(*state)
+    if spec.tool is not None
+}
 
 
 @dataclass(frozen=True, slots=True)

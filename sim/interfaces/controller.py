@@ -355,7 +355,7 @@ class Controller:
             "screenWidth": self._size,
             "screenHeight": self._size,
             "fov": float(session.world.model.camera(session.robot.head_camera).fovy[0]),
-            "collided": any(outcome.code == "BlockedPath" for outcome in failed),
+            "collided": any(outcome.code == FailureCode.BLOCKED_PATH for outcome in failed),
             "results": [
                 {
                     "action": outcome.action.to_text(),

@@ -17,6 +17,7 @@ import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
+from data.interface.failures import FailureCode
 from data.interface.steps import PlanStep
 from sim.robots.spec import available_robots
 from sim.scene.objects import ObjectPlacement
@@ -121,7 +122,7 @@ def _act(session: Session, text: str, video: VideoRecorder) -> bool:
     feedback = session.act(PlanStep.parse(text))
     video.hold(0.4, feedback.to_text())
     outcome = feedback.outcomes[0]
-    if outcome.code not in ("BodyTooHigh", "BodyTooLow"):
+    if outcome.code not in (FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW):
         return feedback.success
     change = outcome.margins["height_m"]
     session.act(PlanStep.parse(f"Move{'Down' if change < 0 else 'Up'}({max(abs(change), 0.01):.3f})"))

@@ -12,14 +12,15 @@ from collections import deque
 import numpy as np
 
 from data.interface.feedback import Feedback
+from data.interface.manual import action_manual, code_manual
 from data.interface.observation import Observation
 from data.interface.steps import PlanStep
 from proprio_mllm.backends.protocol import Backend, ChatImage
 from proprio_mllm.planners.chat.asking import Answer, Asker
-from proprio_mllm.planners.chat.manual import action_manual, code_manual, role
 from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.chat.reflection import Seen, reflect
 from proprio_mllm.planners.chat.replies import Plan, Reflection, ReplyError, read_steps
+from proprio_mllm.planners.chat.role import role
 from proprio_mllm.planners.chat.view import encoded, scene_text
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from data.interface.actions import ACTIONS, ActionKind
+from data.interface.actions import ACTIONS, ActionKind, bringing_about
 from data.interface.bodies import Arm
+from data.interface.effects import Condition
 from data.interface.steps import Action
 from proprio_mllm.planners.scripted.belief import Belief
 from proprio_mllm.planners.scripted.words import Mention, type_of
@@ -23,8 +24,20 @@ __all__ = ["Job", "Want", "holds", "next_jobs"]
 _BIG: Final = ("houseplant", "box", "laundryhamper", "pot", "microwave", "television")
 #: Types that are shut when nobody says otherwise.
 _SHUT: Final = ("cabinet", "drawer", "fridge", "microwave")
-_CHANGES: Final = {"open": "Open", "closed": "Close", "toggled_on": "ToggleOn", "toggled_off": "ToggleOff"}
-_TOOL_VERBS: Final = {"sliced": "Slice", "clean": "Clean"}
+#: The action that brings a goal about, by the goal's kind.
+_CHANGES: Final = {
+    kind: next(bringing_about(condition, value)).name
+    for kind, (condition, value) in {
+        "open": (Condition.OPEN, True),
+        "closed": (Condition.OPEN, False),
+        "toggled_on": (Condition.ON, True),
+        "toggled_off": (Condition.ON, False),
+    }.items()
+}
+_TOOL_VERBS: Final = {
+    kind: next(bringing_about(condition, value)).name
+    for kind, (condition, value) in {"sliced": (Condition.SLICED, True), "clean": (Condition.DIRTY, False)}.items()
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,16 +90,16 @@ def holds(want: Want, belief: Belief) -> bool:
     if thing is None:
         return False
     if want.kind == "held":
-        return belief.arm_with(thing) is not None and thing not in belief.held_in_place
+        return belief.state.arm_with(thing) is not None and thing not in belief.state.in_place
     if want.kind == "lifted":
-        return belief.lifted == thing
+        return belief.state.lifted == thing
     if want.kind == "on":
-        return want.place is not None and belief.at.get(thing) == want.place
+        return want.place is not None and belief.state.at.get(thing) == want.place
     if want.kind in ("open", "closed"):
-        return belief.doors.get(thing) is (want.kind == "open")
+        return belief.state.is_in(Condition.OPEN, thing) is (want.kind == "open")
     if want.kind in ("toggled_on", "toggled_off"):
-        return belief.switches.get(thing) is (want.kind == "toggled_on")
-    return (want.kind, thing) in belief.done
+        return belief.state.is_in(Condition.ON, thing) is (want.kind == "toggled_on")
+    return belief.done(want.kind, thing)
 
 
 def next_jobs(wants: Sequence[Want], belief: Belief, known: Sequence[str]) -> list[Job]:
@@ -98,7 +111,7 @@ def next_jobs(wants: Sequence[Want], belief: Belief, known: Sequence[str]) -> li
     pending = [want for want in wants if not holds(want, belief)]
     if not pending:
         return []
-    if belief.lifted is not None:
+    if belief.state.lifted is not None:
         return [_set_down(pending, belief)]
     through = _through_held_door(pending, belief)
     if through:
@@ -111,7 +124,7 @@ def next_jobs(wants: Sequence[Want], belief: Belief, known: Sequence[str]) -> li
     held = [want for want in pending if want.kind in ("held", "lifted")]
     jobs = [_change(want) for want in pending if want.kind in ("toggled_on", "toggled_off")]
     opening = [_change(want) for want in pending if want.kind == "open"]  # open doors are in the way: rather late
-    if len(held) != 1 or held[0].kind == "lifted" or len(belief.free_arms()) < 2:
+    if len(held) != 1 or held[0].kind == "lifted" or len(belief.state.free_arms()) < 2:
         jobs += opening
     jobs += _carry(light, belief)
     if not light:
@@ -136,23 +149,23 @@ def _is_heavy(thing: str | None, spoken: Mention | None, belief: Belief) -> bool
 
 
 def _is_shut(place: str | None, belief: Belief) -> bool:
-    return place is not None and not belief.doors.get(place, type_of(place) not in _SHUT)
+    return place is not None and not belief.state.conditions[Condition.OPEN].get(place, type_of(place) not in _SHUT)
 
 
 def _pick(thing: str | None, spoken: Mention | None, source: str | None, belief: Belief) -> Job:
     """Taking a thing, or the opening of what it is in."""
-    place = belief.at.get(thing or "", source)
+    place = belief.state.at.get(thing or "", source)
     if place is not None and _is_shut(place, belief) and ("Open", place) not in belief.never:
         return Job("Open", place)
     return Job("Pick", thing, None, spoken, place)
 
 
 def _set_down(pending: Sequence[Want], belief: Belief) -> Job:
-    lifted = belief.lifted
+    lifted = belief.state.lifted
     for want in pending:
         if want.kind == "on" and want.thing == lifted and want.place is not None:
             return Job("PlaceBoth", want.place)
-    return Job("PlaceBoth", belief.here if belief.here != lifted else None)
+    return Job("PlaceBoth", belief.state.here if belief.state.here != lifted else None)
 
 
 def _through_held_door(pending: Sequence[Want], belief: Belief) -> list[Job]:
@@ -160,8 +173,8 @@ def _through_held_door(pending: Sequence[Want], belief: Belief) -> list[Job]:
     arm = belief.holds_furniture()
     if arm is None:
         return []
-    door = belief.hands[arm]
-    other = belief.hands[arm.other]
+    door = belief.state.held[arm]
+    other = belief.state.held[arm.other]
     for want in pending:
         if want.kind == "on" and want.place == door and want.thing == other and other is not None:
             return [Job("Place", door, arm.other)]
@@ -173,30 +186,30 @@ def _through_held_door(pending: Sequence[Want], belief: Belief) -> list[Job]:
 def _work(want: Want, belief: Belief, known: Sequence[str]) -> list[Job]:
     """The next step towards a state that takes a tool, a vessel or heat."""
     if want.kind in _TOOL_VERBS:
-        arm = belief.arm_with(want.tool)
+        arm = belief.state.arm_with(want.tool)
         if arm is None:
             return [_pick(want.tool, want.spoken_tool, None, belief)]
-        if want.thing in belief.unsteady and want.thing not in belief.held_in_place:
+        if want.thing in belief.unsteady and want.thing not in belief.state.in_place:
             return [Job("Hold", want.thing, arm.other, want.spoken_thing)]
         return [Job(_TOOL_VERBS[want.kind], want.thing, arm, want.spoken_thing, want.source)]
     if want.kind == "used_up":
         return [Job("UseUp", want.thing, None, want.spoken_thing, want.source)]
     if want.kind == "filled":
         return _fill(want, belief, known)
-    if want.kind == "cooked" and want.place is not None and belief.at.get(want.thing or "") == want.place:
-        if belief.doors.get(want.place) is not False and type_of(want.place) in _SHUT:
+    if want.kind == "cooked" and want.place is not None and belief.state.at.get(want.thing or "") == want.place:
+        if belief.state.is_in(Condition.OPEN, want.place) is not False and type_of(want.place) in _SHUT:
             return [Job("Close", want.place)]
-        return [Job("ResetArm", "", Arm.RIGHT) if belief.switches.get(want.place) else Job("ToggleOn", want.place)]
+        return [Job("ResetArm", "", Arm.RIGHT) if belief.state.is_in(Condition.ON, want.place) else Job("ToggleOn", want.place)]
     return []
 
 
 def _fill(want: Want, belief: Belief, known: Sequence[str]) -> list[Job]:
     if want.spoken_tool is not None:
-        arm = belief.arm_with(want.tool)
+        arm = belief.state.arm_with(want.tool)
         if arm is None:
             return [_pick(want.tool, want.spoken_tool, None, belief)]
         return [Job("Pour", want.thing, arm, want.spoken_thing, want.source)]
-    bearer = belief.arm_with(want.thing)
+    bearer = belief.state.arm_with(want.thing)
     if bearer is None:
         return [_pick(want.thing, want.spoken_thing, want.source, belief)]
     taps = [name for name in known if type_of(name) in ("faucet", "coffeemachine")]
@@ -207,7 +220,7 @@ def _fill(want: Want, belief: Belief, known: Sequence[str]) -> list[Job]:
         taps = [name for name in taps if type_of(name) == "faucet" and ("ToggleOn", name) not in belief.never]
     else:
         taps = [source]
-    running = [tap for tap in taps if belief.switches.get(tap)]
+    running = [tap for tap in taps if belief.state.is_in(Condition.ON, tap)]
     if not running and taps:
         return [Job("ToggleOn", taps[min(len(belief.failures("Fill", source)), len(taps) - 1)])]
     return [Job("Fill", source, bearer)]
@@ -215,15 +228,15 @@ def _fill(want: Want, belief: Belief, known: Sequence[str]) -> list[Job]:
 
 def _carry(light: Sequence[Want], belief: Belief) -> list[Job]:
     """Carrying small things: the hands are filled first, but one stays free for a door that is still shut."""
-    in_hand = [want for want in light if belief.arm_with(want.thing) is not None]
+    in_hand = [want for want in light if belief.state.arm_with(want.thing) is not None]
     waiting = [want for want in light if want not in in_hand]
     if in_hand:  # what may be anywhere is not searched with full hands
         waiting = [want for want in waiting if want.thing is not None or want.source is not None]
-    free = belief.free_arms()
+    free = belief.state.free_arms()
     door_ahead = any(_is_shut(want.place, belief) for want in in_hand)
     if waiting and free and not door_ahead:
         shut = [want.place for want in waiting if _is_shut(want.place, belief)]
-        ajar = [door for door in shut if door is not None and door not in belief.self_closing]
+        ajar = [door for door in shut if door is not None and door not in belief.state.self_closing]
         if ajar and not in_hand and len(waiting) > 1:
             return [Job("Open", ajar[0])]
         room = 1 if shut else len(free)
@@ -233,7 +246,7 @@ def _carry(light: Sequence[Want], belief: Belief) -> list[Job]:
         if _is_shut(want.place, belief) and free:
             jobs.append(Job("Open", want.place))
         else:
-            jobs.append(Job("Place", want.place, belief.arm_with(want.thing)))
+            jobs.append(Job("Place", want.place, belief.state.arm_with(want.thing)))
     return jobs
 
 
@@ -262,17 +275,17 @@ def _with_free_hand(jobs: list[Job], wants: Sequence[Want], belief: Belief) -> l
     needed = head.arm if head.arm is not None and head.verb in ("Hold", "Pick") else None
     if head.arm is not None and needed is None:
         return jobs
-    free = belief.free_arms()
+    free = belief.state.free_arms()
     if (len(free) == 2) if both else (needed in free if needed is not None else bool(free)):
         return jobs
     tools = {want.tool for want in wants if want.tool is not None and not holds(want, belief)}
     kept = {want.thing for want in wants if want.kind == "held"} | tools | {head.target}
-    arms = [arm for arm, item in belief.hands.items() if item is not None and (needed is None or arm is needed)]
-    arms.sort(key=lambda arm: belief.hands[arm] in kept)
+    arms = [arm for arm, item in belief.state.held.items() if item is not None and (needed is None or arm is needed)]
+    arms.sort(key=lambda arm: belief.state.held[arm] in kept)
     for arm in arms:
-        item = belief.hands[arm]
-        if item in belief.held_in_place or item in belief.self_closing:
+        item = belief.state.held[arm]
+        if item in belief.state.in_place or item in belief.state.self_closing:
             return [Job("Release", "", arm)]
         spot = next((want.place for want in wants if want.kind == "on" and want.thing == item), None)
-        return [Job("Place", spot or belief.here, arm)]
+        return [Job("Place", spot or belief.state.here, arm)]
     return jobs

@@ -9,6 +9,8 @@ from typing import Final
 
 import numpy as np
 
+from data.interface.effects import Condition
+from data.interface.failures import FailureCode
 from data.interface.observation import Observation
 from data.interface.steps import Action
 from proprio_mllm.planners.furniture import CONTAINERS, SEATS, SURFACES
@@ -83,10 +85,10 @@ class Memory:
 
     def is_near(self, target: str, place: str | None) -> bool:
         """Whether the robot went to a thing, or to what it stands on, last."""
-        here = self.belief.here
+        here = self.belief.state.here
         if here is None:
             return False
-        where = self.belief.at.get(target, place if place is not None else self._found_at.get(target))
+        where = self.belief.state.at.get(target, place if place is not None else self._found_at.get(target))
         return here == target or (here == where and here in self.belief.visited and target in self._visible)
 
     def search(self, mention: Mention | None) -> Action:
@@ -104,14 +106,16 @@ class Memory:
                 return self._tried
         while ways:
             action = self._tried = ways.pop(0)
-            if action.name != "Open" or (action.object_id and self.belief.doors.get(action.object_id) is not True):
+            if action.name != "Open" or (
+                action.object_id and self.belief.state.is_in(Condition.OPEN, action.object_id) is not True
+            ):
                 self._blocked_before = self._blocked_then = len(self._blocked(action))
                 return action
         return Action("Done")
 
     def _blocked(self, action: Action) -> list[str]:
         events = self.belief.failures(action.name, action.object_id)
-        return [event.code for event in events if event.code == "BlockedPath"]
+        return [event.code for event in events if event.code == FailureCode.BLOCKED_PATH]
 
     def _round(self, mention: Mention) -> list[Action]:
         named = None if mention.place is None else self.find(mention.place)
@@ -122,7 +126,7 @@ class Memory:
         steps = [] if named is not None else [Action("MoveUp", amount=0.2), *[Action("RotateLeft", amount=90.0)] * 3]
         for name in order:
             steps.append(Action("GoTo", object_id=name))
-            free = self.belief.free_arms()
+            free = self.belief.state.free_arms()
             if type_of(name) in CONTAINERS and free:
                 steps.append(Action("Open", arm=free[0], object_id=name))
             looks = _LOOKS if name == named else _LOOKS[:2]

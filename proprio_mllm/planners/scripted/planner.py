@@ -17,6 +17,7 @@ import numpy as np
 
 from data.interface.actions import ACTIONS, ActionKind
 from data.interface.bodies import Arm
+from data.interface.failures import FailureCode
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
 from data.interface.steps import Action, PlanStep
@@ -41,12 +42,21 @@ _ASIDE_NAMES: Final = ("MoveBack", "MoveRight", "MoveLeft")
 #: Failures of one action after which it is given up.
 _PATIENCE: Final = 16
 #: Codes after which the same thing may work when it is tried again.
-_BAD_LUCK: Final = ("NothingHappened", "Locked", "Slipped", "Spilled")
+_BAD_LUCK: Final = (FailureCode.NOTHING_HAPPENED, FailureCode.LOCKED, FailureCode.SLIPPED, FailureCode.SPILLED)
 #: Codes that a better knowledge of the world answers: what comes next is another job.
 _KNOWLEDGE: Final = (
-    "AlreadyInState", "NotDirty", "HandOccupied", "HandEmpty", "NeedsTwoHands", "NotLiftable", "ReceptacleClosed",
-    "NeedsSteadying", "SourceOff", "AlreadyHeld", "InUse",
-)  # fmt: skip
+    FailureCode.ALREADY_IN_STATE,
+    FailureCode.NOT_DIRTY,
+    FailureCode.HAND_OCCUPIED,
+    FailureCode.HAND_EMPTY,
+    FailureCode.NEEDS_TWO_HANDS,
+    FailureCode.NOT_LIFTABLE,
+    FailureCode.RECEPTACLE_CLOSED,
+    FailureCode.NEEDS_STEADYING,
+    FailureCode.SOURCE_OFF,
+    FailureCode.ALREADY_HELD,
+    FailureCode.IN_USE,
+)
 _WITH_OBJECT: Final = ("Pick", "ToggleOn", "ToggleOff", "Open", "Place")
 
 
@@ -128,12 +138,12 @@ class ScriptedPlanner:
 
     def _get_free(self, belief: Belief) -> Action | None:
         """A step aside when a way is blocked, a rise of what both hands carry; None when nothing is in the way."""
-        if belief.lifted is not None and belief.lowered_m > 0.02 and not belief.at_limit and self._just("Lift", belief):
+        if belief.state.lifted is not None and belief.lowered_m > 0.02 and not belief.at_limit and self._just("Lift", belief):
             return Action("MoveUp", amount=round(min(1.0, belief.lowered_m), 2))
-        if not belief.last or belief.last[0].code != "BlockedPath":
+        if not belief.last or belief.last[0].code != FailureCode.BLOCKED_PATH:
             return None
         walking = belief.last[0].action.name == "GoTo"
-        if belief.lifted is not None and belief.blocked == 1:
+        if belief.state.lifted is not None and belief.blocked == 1:
             return Action("MoveUp", amount=_RISES_M[1])
         if walking and belief.blocked == 1:
             return None  # another stance may do
@@ -152,17 +162,22 @@ class ScriptedPlanner:
         last = next((event for event in belief.last if event.about(job.verb, target) and not event.ok), None)
         if last is None:
             return self._walk(job, belief, failed=bool(failed))
-        if last.code in ("BodyTooHigh", "BodyTooLow"):
-            return self._height(job, belief, up=last.code == "BodyTooLow")
+        if last.code in (FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW):
+            return self._height(job, belief, up=last.code == FailureCode.BODY_TOO_LOW)
         if last.code in _BAD_LUCK and len(failed) % 3:
             return None
         if last.code in _KNOWLEDGE:
             return self._walk(job, belief, failed=False)
-        if last.code == "Obstructed" and job.verb.startswith("Place") and not belief.heights and True not in belief.at_limit:
+        if (
+            last.code == FailureCode.OBSTRUCTED
+            and job.verb.startswith("Place")
+            and not belief.heights
+            and True not in belief.at_limit
+        ):
             return Action("MoveUp", amount=_RISES_M[0])  # over the edge
-        if last.code in ("Obstructed", "GraspMissed", "HandleSlipped") and job.arm is None:
+        if last.code in (FailureCode.OBSTRUCTED, FailureCode.GRASP_MISSED, FailureCode.HANDLE_SLIPPED) and job.arm is None:
             arms = {event.action.arm for event in failed if event.code == last.code}
-            if len(arms) == 1 and len(belief.free_arms()) == 2:
+            if len(arms) == 1 and len(belief.state.free_arms()) == 2:
                 return None  # the other arm may
         return self._stance(job, belief)
 
@@ -173,7 +188,7 @@ class ScriptedPlanner:
             return self._stance(job, belief)
         if events and events[0].action.name in _ASIDE_NAMES:
             return Action("GoTo", object_id=job.target)
-        near = belief.here == job.target if job.verb == "Lift" else self._memory.is_near(job.target or "", job.place)
+        near = belief.state.here == job.target if job.verb == "Lift" else self._memory.is_near(job.target or "", job.place)
         return None if failed or near else Action("GoTo", object_id=job.target)
 
     def _height(self, job: Job, belief: Belief, up: bool) -> Action:
@@ -202,7 +217,7 @@ class ScriptedPlanner:
         for job in others:
             if job.target in (None, "") or job.verb not in _WITH_OBJECT or head.verb not in _WITH_OBJECT:
                 continue
-            if job.arm is arm or (job.arm is None and arm.other not in belief.free_arms()):
+            if job.arm is arm or (job.arm is None and arm.other not in belief.state.free_arms()):
                 continue
             if job.target == head.target and not head.verb == job.verb == "Place":
                 continue
@@ -213,7 +228,7 @@ class ScriptedPlanner:
 
     def _arm(self, job: Job, belief: Belief) -> Arm:
         """The free arm on the side where the target should be; the other one after a failure that an arm can be blamed for."""
-        free = belief.free_arms() or (Arm.RIGHT,)
+        free = belief.state.free_arms() or (Arm.RIGHT,)
         side = Arm.LEFT if belief.bearing_deg > 0 else Arm.RIGHT
         last = next((event for event in belief.last if event.about(job.verb, job.target)), None)
         if last is not None and not last.ok and last.action.arm is not None and last.code not in _BAD_LUCK:

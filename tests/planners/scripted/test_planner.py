@@ -9,6 +9,7 @@ import pytest
 
 from configs.schema.robot import RobotConfig
 from data.interface.bodies import Arm
+from data.interface.effects import Condition
 from data.interface.episode import Outcome
 from data.interface.observation import Camera, HistoryItem, Observation, Proprioception
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, run_episode
@@ -53,18 +54,18 @@ def test_belief_follows_hands_doors_and_places() -> None:
             "nonsense InvalidOutput",
         )
     )
-    assert belief.hands == {Arm.RIGHT: None, Arm.LEFT: None}
-    assert belief.at == {"Mug_1": "Fridge_1"}
-    assert belief.doors == {"Fridge_1": True}
-    assert belief.switches == {"LightSwitch_1": True}
-    assert belief.here == "SideTable_1"
+    assert belief.state.held == {Arm.RIGHT: None, Arm.LEFT: None}
+    assert belief.state.at == {"Mug_1": "Fridge_1"}
+    assert belief.state.conditions[Condition.OPEN] == {"Fridge_1": True}
+    assert belief.state.conditions[Condition.ON] == {"LightSwitch_1": True}
+    assert belief.state.here == "SideTable_1"
     assert belief.failures("Pick", "Cup_1") == [], "a success makes earlier failures moot"
 
 
 def test_a_failure_beside_a_success_is_remembered() -> None:
     belief = Belief.of(history("Pick(left, Cup_1) TooFar; Pick(right, Mug_1) ok"))
     assert [event.code for event in belief.failures("Pick", "Cup_1")] == ["TooFar"]
-    assert belief.arm_with("Mug_1") is Arm.RIGHT
+    assert belief.state.arm_with("Mug_1") is Arm.RIGHT
 
 
 @pytest.mark.parametrize(
@@ -81,7 +82,7 @@ def test_a_failure_beside_a_success_is_remembered() -> None:
 )
 def test_belief_about_hands(lines: list[str], hands: tuple[str | None, str | None]) -> None:
     belief = Belief.of(history(*lines))
-    assert (belief.hands[Arm.RIGHT], belief.hands[Arm.LEFT]) == hands
+    assert (belief.state.held[Arm.RIGHT], belief.state.held[Arm.LEFT]) == hands
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from typing import Final
 
 from data.interface.actions import ACTIONS, ActionKind
 from data.interface.bodies import Arm
+from data.interface.effects import Grasp, HoldOpen, LetGo, PutDown
 from data.interface.steps import Action, ActionError
 from proprio_mllm.planners.chat.dag_plan.graph import Graph, Node, NodeKind, NodeReply
 from proprio_mllm.planners.chat.dag_plan.hands import EMPTY, Capacity, Hands
@@ -23,13 +24,16 @@ __all__ = ["KINDS", "GraphError", "check_graph"]
 
 #: Largest graph that is looked at.
 _LARGEST: Final = 60
-_BODY: Final = tuple(name for name, spec in ACTIONS.items() if spec.kind is ActionKind.BODY)
 #: The actions of each type of node.
 KINDS: Final[Mapping[NodeKind, tuple[str, ...]]] = {
-    "occupy": ("Pick", "Hold", "Lift", "Open"),
-    "release": ("Place", "Release", "PlaceBoth"),
-    "tool-use": ("Slice", "Clean", "Pour", "Fill"),
-    "operate": ("Open", "Close", "ToggleOn", "ToggleOff", "UseUp", "ResetArm", *_BODY),
+    "occupy": tuple(name for name, spec in ACTIONS.items() if spec.has_effect(Grasp, HoldOpen)),
+    "release": tuple(name for name, spec in ACTIONS.items() if spec.has_effect(PutDown, LetGo)),
+    "tool-use": tuple(name for name, spec in ACTIONS.items() if spec.tool is not None),
+    "operate": tuple(
+        name
+        for name, spec in ACTIONS.items()
+        if spec.kind is not ActionKind.EPISODE and spec.tool is None and not spec.has_effect(Grasp, PutDown, LetGo)
+    ),
     "complete": ("Done",),
 }
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from data.interface.failures import FailureCode
 from data.interface.feedback import ActionOutcome, Feedback
 from data.interface.observation import Observation
 from data.interface.steps import Action, PlanStep
@@ -28,11 +29,17 @@ __all__ = ["Execution"]
 
 _DONE: Final = PlanStep((Action("Done"),))
 #: Codes of an effect that is there already.
-_HOLDS: Final = ("AlreadyInState", "NotDirty", "AlreadyHeld")
+_HOLDS: Final = (FailureCode.ALREADY_IN_STATE, FailureCode.NOT_DIRTY, FailureCode.ALREADY_HELD)
 #: Codes that say that the place was wrong and nothing has been touched.
-_NOT_THERE: Final = ("TooFar", "BodyTooHigh", "BodyTooLow", "Obstructed", "InUse")
+_NOT_THERE: Final = (
+    FailureCode.TOO_FAR,
+    FailureCode.BODY_TOO_HIGH,
+    FailureCode.BODY_TOO_LOW,
+    FailureCode.OBSTRUCTED,
+    FailureCode.IN_USE,
+)
 #: Codes that count against an arm at an object.
-_PENALISED: Final = ("Obstructed", "TooFar", "GraspMissed")
+_PENALISED: Final = (FailureCode.OBSTRUCTED, FailureCode.TOO_FAR, FailureCode.GRASP_MISSED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +86,7 @@ class Execution:
         if walking is not None and not feedback.success:
             self._give_up(walking)
             return True
-        if any(outcome.code == "ArmConflict" for outcome in feedback.outcomes):
+        if any(outcome.code == FailureCode.ARM_CONFLICT for outcome in feedback.outcomes):
             self._alone |= {one.job.node.id for one in tries}
             return False
         failed = [self._judge(one, outcome) for one, outcome in zip(tries, feedback.outcomes, strict=False)]
@@ -88,7 +95,7 @@ class Execution:
     def _judge(self, one: _Try, outcome: ActionOutcome) -> bool:
         """Settles a node by its outcome; whether it failed for good."""
         node, code = one.job.node, outcome.code
-        if outcome.success or code in _HOLDS or (node.verb, code) == ("Release", "HandEmpty"):
+        if outcome.success or code in _HOLDS or (node.verb, code) == ("Release", FailureCode.HAND_EMPTY):
             self._done.add(node.id)
             if outcome.success and node.anchors and node.verb == "Open" and node.target is not None:
                 self._memory.doors.add(node.target)
@@ -144,7 +151,7 @@ class Execution:
             here=memory.here,
             known=frozenset(observation.known_objects),
             visible=frozenset(observation.visible_objects),
-            at={node.target: node.at for node in self._graph.nodes if node.target and node.at} | memory.belief.at,
+            at={node.target: node.at for node in self._graph.nodes if node.target and node.at} | memory.belief.state.at,
             penalties=memory.penalties,
             walked_only=frozenset(self._walked_only),
             alone=frozenset(self._alone),

@@ -44,12 +44,12 @@ class Memory:
     @property
     def hands(self) -> Hands:
         """What the right and the left hand are believed to hold."""
-        lifted = self.belief.lifted
-        right, left = (lifted or self.belief.hands[arm] for arm in ARMS)
+        lifted = self.belief.state.lifted
+        right, left = (lifted or self.belief.state.held[arm] for arm in ARMS)
         return right, left
 
     @property
     def anchored(self) -> frozenset[str]:
         """What hands hold in place."""
         held = {item for item in self.hands if item is not None}
-        return frozenset(held & (self.belief.held_in_place | self.doors))
+        return frozenset(held & (self.belief.state.in_place | self.doors))

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Final
 
 from data.interface.bodies import Arm
+from data.interface.effects import Condition
 from data.interface.steps import Action
 from proprio_mllm.planners.furniture import CONTAINERS, SEATS, SURFACES
 from proprio_mllm.planners.scripted.belief import Belief
@@ -56,8 +57,8 @@ class Search:
         while self._ways:
             action = self._ways.popleft()
             if action.name == "Open":
-                free = belief.free_arms()
-                if not free or belief.doors.get(action.object_id or "") or here != action.object_id:
+                free = belief.state.free_arms()
+                if not free or belief.state.is_in(Condition.OPEN, action.object_id or "") or here != action.object_id:
                     continue
                 return replace(action, arm=free[0])
             if action.name != "GoTo" or action.object_id != here:
