@@ -16,7 +16,7 @@ from pathlib import Path
 from configs.schema.collect import CollectConfig
 from proprio_mllm.evaluation.dagger import student_in_words
 from proprio_mllm.report.statistics import wilson
-from sim.collection.text_world import play_alone
+from sim.collection.text_planning import play_alone
 
 
 def main() -> int:

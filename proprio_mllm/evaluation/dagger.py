@@ -2,7 +2,7 @@
 
 Demonstrations hardly show what follows a learned planner's own mistakes: placing with an empty hand, picking up what it holds,
 asking for an object it has not seen, going where it stands. The base model's mistakes, each with the expert's next step, join
-the demonstrations of stages 2 and 3, and those in words alone (`sim.collection.text_world`), which cost a fiftieth, the
+the demonstrations of stages 2 and 3, and those in words alone (`sim.collection.text_planning`), which cost a fiftieth, the
 exercises. This is the bridge that `train.py` wires: training asks with a `CorrectionRequest` and reads `demos` or `exercises`
 shards.
 
@@ -95,7 +95,7 @@ def _one_thread() -> Iterator[None]:
 def _part(config: CollectConfig, part: int, model: str) -> list[dict[str, Any]]:
     """One part; imports simulator and model only here, so that workers start light."""
     if config.kind == "exercises":
-        from sim.collection.text_world import corrections_of_part as in_words
+        from sim.collection.text_planning import corrections_of_part as in_words
 
         return list(in_words(config, part, student_in_words(model)))
     os.environ.setdefault("MUJOCO_GL", "egl")
@@ -120,7 +120,7 @@ def _student(model: str) -> Callable[[Observation], PlanStep | None]:
 
 
 def student_in_words(model: str) -> Callable[[Sequence[Mapping[str, Any]]], list[PlanStep | None]]:
-    """The model in a folder as a student of `sim.collection.text_world`: greedy steps for moments in words."""
+    """The model in a folder as a student of `sim.collection.text_planning`: greedy steps for moments in words."""
     from proprio_mllm.model.batch import Example
     from proprio_mllm.planners.protocol import parse_reply
     from proprio_mllm.training.asking import LONGEST_STEP, replies

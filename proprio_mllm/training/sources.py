@@ -347,7 +347,7 @@ class Bodies:
 
 
 class Exercises:
-    """Text-planning rows of shards (`sim.collection.text_world` writes them), and logs with names exchanged.
+    """Text-planning rows of shards (`sim.collection.text_planning` writes them), and logs with names exchanged.
 
     Args:
         folder: `exercises` shards.
@@ -411,7 +411,7 @@ class Exercises:
 
 
 class Judgements:
-    """Questions in text alone whether an instruction was carried out (`sim.collection.text_world`)."""
+    """Questions in text alone whether an instruction was carried out (`sim.collection.text_planning`)."""
 
     def __init__(self, folder: Path, cfg: ModelConfig) -> None:
         self.reader = ShardReader(folder, "judgements")

@@ -55,11 +55,11 @@ def rows_of_part(config: CollectConfig, part: int) -> list[dict[str, Any]]:
 
         return list(views_of_part(config, part))
     if config.kind == "exercises":
-        from sim.collection.text_world import exercises_of_part
+        from sim.collection.text_planning import exercises_of_part
 
         return list(exercises_of_part(config, part))
     if config.kind == "judgements":
-        from sim.collection.text_world import judgements_of_part
+        from sim.collection.text_planning import judgements_of_part
 
         return list(judgements_of_part(config, part))
     from sim.collection.demonstrations import demos_of_part

@@ -21,16 +21,24 @@ import numpy as np
 
 from configs.schema.collect import CollectConfig
 from data.interface.actions import ActionKind
-from data.interface.observation import Observation
+from data.interface.observation import HistoryItem, Observation
 from data.interface.steps import Action, PlanStep
 from data.shards import encode_png
-from sim.collection.students import accepted
 from sim.expert.expert import Expert
 from sim.session.session import Session
 from sim.tasks.sample import TRAIN_SEEDS, rng_for, sample_task
 from sim.tasks.task import Task
 
-__all__ = ["Episode", "Student", "corrections_of_part", "demos_of_part", "perturbed", "run_correction", "run_episode"]
+__all__ = [
+    "Episode",
+    "Student",
+    "accepted",
+    "corrections_of_part",
+    "demos_of_part",
+    "perturbed",
+    "run_correction",
+    "run_episode",
+]
 
 #: Plays one episode of a collection with the sessions it may reuse.
 Play = Callable[[CollectConfig, int, dict[tuple[str, str], Session]], "Episode"]
@@ -98,6 +106,20 @@ def run_episode(config: CollectConfig, index: int, sessions: dict[tuple[str, str
 def corrections_of_part(config: CollectConfig, part: int, student: Student) -> Iterator[dict[str, Any]]:
     """Rows of one part of a `demos` folder whose steps the student chose and the expert corrected."""
     yield from _rows_of_part(config, part, lambda cfg, index, sessions: run_correction(cfg, index, sessions, student))
+
+
+def accepted(proposed: PlanStep | None, last: HistoryItem | None) -> PlanStep | None:
+    """The student's step; None where it names none, ends the episode, or does again what has just failed.
+
+    Args:
+        proposed: what the student said.
+        last: the newest entry of the log.
+    """
+    if proposed is None or proposed.actions[0].name == "Done":
+        return None
+    if last is None or all(outcome.endswith(" ok") for outcome in last.feedback.split("; ")):
+        return proposed
+    return None if last.step == proposed.to_text() else proposed
 
 
 def _rows_of_part(config: CollectConfig, part: int, play: Play) -> Iterator[dict[str, Any]]:

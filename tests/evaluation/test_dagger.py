@@ -75,10 +75,10 @@ def test_corrections_in_words_are_exercises(in_words: CorrectionRequest) -> None
     logs = [item["step"] for row in rows for item in row["history"]]
     assert any(step.startswith("Pick(left, ") for step in logs)
     assert all(PlanStep.parse(row["target"]).to_text() == row["target"] for row in rows)
-    # what the student does again after a refusal, the expert does
+    # what has just been refused is done again by the expert alone, where luck was to blame
     for row in rows:
         for before, after in pairwise(row["history"]):
-            assert before["feedback"].endswith(" ok") or before["step"] != after["step"] or after["step"] == row["target"]
+            assert before["feedback"].endswith((" ok", "NothingHappened")) or before["step"] != after["step"]
 
 
 def test_training_keeps_its_threads(in_words: CorrectionRequest, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,10 +10,12 @@ from typing import Any
 import pytest
 
 from configs.schema.collect import CollectConfig
-from data.interface.steps import PlanStep
+from data.interface.actions import ACTIONS
+from data.interface.steps import Action, PlanStep
 from sim.collection.collect import rows_of_part
-from sim.collection.text_world import Exercise, corrections_of_part, play
+from sim.collection.text_planning import Exercise, corrections_of_part, play
 from sim.scene.catalogue import load_catalogue
+from sim.tasks.families import FAMILIES
 
 #: Types that a hand picks up.
 SMALL = {kind.name for kind in load_catalogue().types.values() if kind.pickupable}
@@ -36,6 +38,23 @@ def test_most_episodes_end_in_success_in_spite_of_mistakes(episodes: list[Exerci
     codes = set().union(*(episode.codes for episode in episodes))
     wanted = {"ok", "TooFar", "BodyTooHigh", "BodyTooLow", "HandEmpty", "HandOccupied", "AlreadyHeld", "AlreadyInState"}
     assert wanted | {"ObjectNotKnown", "BothHandsBusy", "GraspMissed"} <= codes
+
+
+def test_every_family_and_every_action_occurs(episodes: list[Exercise]) -> None:
+    more = [*episodes, *(play(CONFIG, 1000 + index) for index in range(700))]
+    history = (item for episode in more for moment in episode.moments for item in moment["history"][-1:] if item["step"])
+    steps = [action.name for item in history for action in PlanStep.parse(item["step"]).actions]
+    assert set(steps) == set(ACTIONS) - {"Done"}
+    assert {episode.family for episode in more} == set(FAMILIES)
+    for family in FAMILIES:
+        some = [episode.success for episode in more if episode.family == family]
+        assert sum(some) > 0.5 * len(some), family
+
+
+def test_codes_are_those_of_the_table(episodes: list[Exercise]) -> None:
+    for item in (item for episode in episodes for item in episode.moments[-1]["history"]):
+        for text, _, code in (outcome.rpartition(" ") for outcome in item["feedback"].split("; ")):
+            assert code == "ok" or code in Action.parse(text).spec.codes, item
 
 
 def test_steps_name_known_objects_and_follow_from_the_log(episodes: list[Exercise]) -> None:
