@@ -33,6 +33,7 @@ check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+	$(BIN)/python tools/structure.py --check
 
 # The released tiny base model behind OpenAI's chat API on http://127.0.0.1:8377/v1, or another: SERVE_ARGS="weights=... port=...".
 serve: $(STAMP)

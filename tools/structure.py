@@ -1,8 +1,11 @@
-"""The structure of a checkout in figures: `python tools/structure.py [FOLDER] [--compare OTHER] [--json] [--acyclic]`.
+"""The structure of a checkout: `python tools/structure.py [FOLDER] [--compare OTHER] [--json]`, or `--check` to judge it.
 
 Counts modules, lines, import cycles (imports under TYPE_CHECKING and inside functions included), the classes with most public
 methods, the largest modules and functions, public names, `python -m` commands, and the files that name an action, which is what
-a new skill would have to touch. Nothing is imported: the code is read as text. `--acyclic` only says whether there are cycles.
+a new skill would have to touch. Nothing is imported: the code is read as text.
+
+`--check` fails on an import cycle, and on an import that `[tool.structure.allowed]` of pyproject.toml does not list: for each
+package what it may import, of this project and, for the interface, of others. The most specific package decides.
 """
 
 from __future__ import annotations
@@ -12,6 +15,8 @@ import ast
 import json
 import re
 import sys
+import tomllib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +76,28 @@ def cycles(edges: dict[str, set[str]]) -> list[list[str]]:
     return sorted(found)
 
 
+def within(module: str, packages: Sequence[str]) -> str:
+    """The most specific of some packages that a module belongs to, empty when it belongs to none."""
+    return max((one for one in packages if module == one or module.startswith(f"{one}.")), key=len, default="")
+
+
+def foreign(root: Path) -> Iterator[str]:
+    """Imports that the allowlists of a checkout do not list."""
+    allowed = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["structure"]["allowed"]
+    modules = modules_of(root)
+    for name, path in modules.items():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        home = within(name, list(allowed))
+        for other in sorted(imports_of(tree, name, modules)):
+            if not within(other, [home, *allowed[home]]):
+                yield f"{name} imports {other}; {home} may import {', '.join(allowed[home]) or 'nothing'}"
+        if home == "data.interface":
+            outside = {node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+            outside |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+            for other in sorted({one.split(".")[0] for one in outside} - set(sys.stdlib_module_names) - {"data", "numpy"}):
+                yield f"{name} imports {other}; the interface needs numpy and the standard library alone"
+
+
 def measure(root: Path) -> dict[str, Any]:
     """All figures of a checkout."""
     modules = modules_of(root)
@@ -115,17 +142,18 @@ def say(*parts: object) -> None:
 
 
 def main() -> int:
-    """Prints the figures; with `--acyclic` only the cycles, and exit code 1 when there are any."""
+    """Prints the figures; with `--check` what is wrong, and exit code 1 when something is."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?", default=Path())
     parser.add_argument("--compare", type=Path, help="another checkout, shown first")
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--acyclic", action="store_true")
+    parser.add_argument("--check", action="store_true")
     options = parser.parse_args()
-    if options.acyclic:
-        found = measure(options.folder)["import cycles"]
-        for component in found:
-            say("import cycle:", " ".join(component))
+    if options.check:
+        found = [f"import cycle: {' '.join(one)}" for one in measure(options.folder)["import cycles"]]
+        found += foreign(options.folder)
+        for line in found:
+            say(line)
         return int(bool(found))
     columns = [measure(folder) for folder in ([options.compare] if options.compare else []) + [options.folder]]
     if options.json:

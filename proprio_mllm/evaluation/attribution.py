@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from data.interface.actions import ActionKind
+from data.interface.effects import Grasp, LetGo, PutDown
 from data.interface.failures import INVALID_OUTPUT, FailureCategory, FailureCode
 from data.interface.steps import Action
 
@@ -122,7 +123,7 @@ def _standing(trace: Sequence[Mapping[str, Any]], unmet: Collection[str]) -> lis
 
 
 def _loads(trace: Sequence[Mapping[str, Any]]) -> dict[tuple[int, int], str]:
-    """What was to be put down by each Place and PlaceBoth, by step and action; a hand is believed to keep what it took."""
+    """What was to be put down by each action that puts down, by step and action; a hand is believed to keep what it took."""
     held: dict[str, str] = {}  # by arm, `both` for what is lifted
     found: dict[tuple[int, int], str] = {}
     for step, entry in enumerate(trace):
@@ -131,11 +132,11 @@ def _loads(trace: Sequence[Mapping[str, Any]]) -> dict[tuple[int, int], str]:
                 continue
             action = Action.parse(outcome["action"])
             hand = "both" if action.arm is None else action.arm.value
-            if action.name in ("Pick", "Hold", "Lift") and outcome["ok"]:
+            if action.spec.has_effect(Grasp) and outcome["ok"]:
                 held = {other: item for other, item in held.items() if item != action.object_id}
                 held[hand] = action.object_id or ""
-            elif action.name in ("Place", "PlaceBoth") and hand in held:
+            elif action.spec.has_effect(PutDown) and hand in held:
                 found[step, number] = held[hand]
-            if action.name in ("Place", "PlaceBoth", "Release") and (outcome["ok"] or outcome["code"] in _LOST):
+            if action.spec.has_effect(PutDown, LetGo) and (outcome["ok"] or outcome["code"] in _LOST):
                 held.pop(hand, None)
     return found

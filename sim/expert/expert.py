@@ -16,6 +16,7 @@ from typing import Final
 
 import numpy as np
 
+from data.interface.actions import ACTIONS
 from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.steps import Action, PlanStep
@@ -223,7 +224,7 @@ class Expert:
         """Whether a job takes an arm that is disabled."""
         if job.arm is not None:
             return job.arm not in self._usable
-        return job.verb in ("Lift", "PlaceBoth") and len(self._usable) < 2
+        return ACTIONS[job.verb].arms == 2 and len(self._usable) < 2
 
     # ---- memory
 
@@ -274,7 +275,7 @@ class Expert:
         """Arms that may do the job, preferred one first: the one on the target's side, the right one straight ahead."""
         if job.arm is not None:
             return (job.arm,)
-        if job.verb in ("Lift", "PlaceBoth"):
+        if ACTIONS[job.verb].arms == 2:
             return (None,)
         free = facts.free_arms()
         if len(free) == 2 and self._bearing_rad(job.target) > np.deg2rad(8.0):
@@ -286,7 +287,7 @@ class Expert:
         if arm is None or head.then is not None:
             return _single(head.action(arm))
         for job in others:
-            if job.verb in ("Lift", "PlaceBoth") or job.then is not None or not job.target:
+            if ACTIONS[job.verb].arms == 2 or job.then is not None or not job.target:
                 continue
             if job.target not in self._session.known_objects or self._is_far(job.target):
                 continue
@@ -393,7 +394,13 @@ class Expert:
     def _goes_with(self, head: Job, other: Job) -> bool:
         """Whether two jobs might be done at once, by one arm each."""
         arm_jobs = head.arm is None or other.arm is None or head.arm is not other.arm
-        if not other.target or other.then is not None or not arm_jobs or {head.verb, other.verb} & {"Lift", "PlaceBoth"}:
+        if (
+            not other.target
+            or other.then is not None
+            or not arm_jobs
+            or ACTIONS[head.verb].arms == 2
+            or ACTIONS[other.verb].arms == 2
+        ):
             return False
         if other.target not in self._session.known_objects:
             return False

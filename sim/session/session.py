@@ -19,6 +19,7 @@ import numpy as np
 
 from data.interface.actions import ActionKind
 from data.interface.bodies import Arm
+from data.interface.effects import PutDown
 from data.interface.feedback import ActionOutcome, Feedback
 from data.interface.observation import HistoryItem, Observation
 from data.interface.steps import Action, PlanStep
@@ -385,8 +386,6 @@ class Session:
 def _subject(body: Body, action: Action) -> str:
     """Id of the object whose rule decides an action's outcome: what is put down or poured, else what the action names."""
     held = None
-    if action.name in ("Place", "Pour", "Fill") and action.arm is not None:
-        held = body.hands.held[action.arm]
-    elif action.name == "PlaceBoth":
-        held = body.hands.lifted
+    if action.spec.has_effect(PutDown) or action.spec.tool == "vessel":
+        held = body.hands.lifted if action.arm is None else body.hands.held[action.arm]
     return held or action.object_id or ""

@@ -262,6 +262,9 @@ def _check_event(controller: Controller, event: Event) -> list[str]:
     known = {code.value for code in FAILURES}
     if metadata["failureCode"] and metadata["failureCode"] not in known:
         wrong.append(f"unknown failure code {metadata['failureCode']!r}")
+    action = str(metadata["lastAction"])
+    if metadata["failureCode"] in known and action in ACTIONS and metadata["failureCode"] not in ACTIONS[action].codes:
+        wrong.append(f"{action} failed with {metadata['failureCode']}, which the table of actions does not list for it")
     if metadata["lastActionSuccess"] and metadata["failureCode"]:
         wrong.append(f"success with code {metadata['failureCode']}")
     if event.frame.dtype != np.uint8 or not np.isfinite(event.depth_frame).all():
