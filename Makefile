@@ -37,7 +37,7 @@ check: $(STAMP)
 
 # The released tiny base model behind OpenAI's chat API on http://127.0.0.1:8377/v1, or another: SERVE_ARGS="weights=... port=...".
 serve: $(STAMP)
-	$(BIN)/python -m proprio_mllm.backends.serve $(SERVE_ARGS)
+	$(BIN)/python -m proprio_mllm serve $(SERVE_ARGS)
 
 # Real human motion (two OMOMO clips, five climbing clips), data only: 100 MB, used by tests marked `motions`.
 motions: $(STAMP)

@@ -1,6 +1,6 @@
 """How well a memory's retrieval finds related tasks and moments, and how long sentence embedding takes.
 
-    python -m proprio_mllm.planners.memory_build demos=DEMOS out=MEMORY
+    python -m proprio_mllm memory demos=DEMOS out=MEMORY
     python benchmarks/retrieval.py MEMORY DEMOS [--views 600]
 
 Asked are the demonstrations whose task and instruction are not in the memory. `family`: the nearest stored task is of the same

@@ -1,21 +1,23 @@
-"""Command lines of tools that take a few `key=value` arguments and no config groups: values are YAML, checked by `build`.
+"""Command lines of the tools: a command, names such as a run's folder, then `key=value` options, which are YAML.
 
-`--help` among them prints what there is and ends the program, as `argparse` does.
+`python -m sim` and `python -m proprio_mllm` list their commands; `--help` after a command prints what it takes. train.py and
+eval.py are Hydra's (`configs.app`).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import yaml
 
 from configs.help import asks_for_help, tool_help
-from configs.validate import ConfigError, build
+from configs.validate import ConfigError, allowed_values, build
 
-__all__ = ["read_arguments"]
+__all__ = ["dispatch", "read_arguments", "read_named"]
 
 T = TypeVar("T")
 
@@ -43,3 +45,49 @@ def read_arguments(cls: type[T], arguments: Sequence[str]) -> T:
         except yaml.YAMLError:
             raise ConfigError(f"{argument!r}: the value cannot be read") from None
     return build(cls, values)
+
+
+def read_named(cls: type[T], arguments: Sequence[str], names: tuple[str, ...], more: bool = False) -> tuple[list[str], T]:
+    """Splits a command line into names and options.
+
+    Args:
+        cls: dataclass of the options.
+        arguments: of the command line.
+        names: what the names stand for, for messages.
+        more: whether the last one may be given several times.
+
+    Raises:
+        SystemExit: after `-h` or `--help`, with code 0.
+        ConfigError: on too few or too many names, or a wrong option.
+    """
+    if asks_for_help(arguments):
+        read_arguments(cls, arguments)
+    given = [argument for argument in arguments if "=" not in argument]
+    if len(given) < len(names) or (len(given) > len(names) and not more):
+        expected = " ".join(names) + (f" [{names[-1]} ...]" if more else "")
+        raise ConfigError(f"expected {expected} [key=value ...], got {' '.join(arguments) or 'nothing'}")
+    return given, read_arguments(cls, [argument for argument in arguments if "=" in argument])
+
+
+def dispatch(program: str, commands: Mapping[str, tuple[str, str]], arguments: Sequence[str]) -> int:
+    """Runs one of several commands; without one, or with `--help` in its place, lists them.
+
+    Args:
+        program: what is typed before the command.
+        commands: module, whose `main` takes the other arguments, and meaning by name.
+        arguments: of the command line.
+
+    Returns:
+        The command's exit code; 0 for the list, 2 for a command that does not exist.
+    """
+    name, *rest = arguments or ["--help"]
+    if name in ("-h", "--help"):
+        width = max(map(len, commands))
+        lines = [f"usage: {program} COMMAND [NAME ...] [key=value ...]", "", "Commands (each has its own --help):", ""]
+        lines += [f"  {name:<{width}}  {meaning}" for name, (_, meaning) in commands.items()]
+        sys.stdout.write("\n".join(lines) + "\n")
+        return 0
+    if name not in commands:
+        sys.stderr.write(f"{program}: no command {name!r}; {allowed_values(name, commands)}\n")
+        return 2
+    return importlib.import_module(commands[name][0]).main(rest)

@@ -6,7 +6,7 @@ sitting clips and cannot know the robot.
 
 Paper: data preparation, "filtered with PHC", 11k clips. PHC's test by tracking in physics is left out here
 (`data.tracking` measures a part of it).
-Run `python -m data filter table FOLDER` for what was dropped, where and why.
+Run `python -m proprio_mllm report filter FOLDER` for what was dropped, where and why.
 """
 
 from __future__ import annotations

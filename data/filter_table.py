@@ -1,4 +1,4 @@
-"""Table of what the filters dropped: `python -m data filter table FOLDER`.
+"""Table of what the filters dropped: `python -m proprio_mllm report filter FOLDER`.
 
 Of a folder of `clips` shards it counts what the manifest records, from the clips in the list to those kept for each robot. Of
 a folder in HumanML3D's format, which needs no processing, it counts what PHC's list decides about its ids.
@@ -24,7 +24,7 @@ from data.shards import Manifest, ShardError
 
 __all__ = ["list_counts", "main", "manifest_table", "shard_counts"]
 
-_USAGE = "usage: python -m data filter table FOLDER (clips shards, or a folder in HumanML3D's format)\n"
+_USAGE = "usage: python -m proprio_mllm report filter FOLDER (clips shards, or a folder in HumanML3D's format)\n"
 
 
 def list_counts(ids: Iterable[str]) -> Counter[str]:
@@ -119,10 +119,10 @@ def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 1 when the folder holds neither, 2 on wrong arguments."""
     if shows_help(arguments, __doc__):
         return 0
-    if len(arguments) != 2 or arguments[0] != "table":
+    if len(arguments) != 1:
         sys.stderr.write(_USAGE)
         return 2
-    folder = Path(arguments[1]).expanduser()
+    folder = Path(arguments[0]).expanduser()
     try:
         if (folder / "manifest.json").is_file():
             table = manifest_table(Manifest.load(folder))

@@ -10,7 +10,7 @@ floor, and parts of the robot that come too near to each other, are residuals as
 Shape letters: T frames, J joints. Frames: world, z up, floor at 0.
 
 Paper: data preparation, "retargeted to the robot". Left out: hands' orientation, objects.
-Run `python -m data retarget report` for a table of metrics.
+Run `python -m proprio_mllm report retarget` for a table of metrics.
 """
 
 from __future__ import annotations

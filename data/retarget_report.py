@@ -1,8 +1,8 @@
-"""Table of retargeting metrics: `python -m data retarget report [clips] [--physics]`.
+"""Table of retargeting metrics: `python -m proprio_mllm report retarget [clips=72] [physics=true]`.
 
 Columns: generated clips per robot, and what `make motions` installed: each OMOMO clip, and the parts of the climbing clips on
-level floor together (weighted by frames). What the project aims at is in the last column. With `--physics` rows are added that
-say whether the motors of waist and arms can follow (`data.tracking`), which takes longer than everything else.
+level floor together (weighted by frames). What the project aims at is in the last column. With `physics=true` rows are added
+that say whether the motors of waist and arms can follow (`data.tracking`), which takes longer than everything else.
 
 Paper: none.
 """
@@ -19,7 +19,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from configs.help import shows_help
+from configs.arguments import read_arguments
+from configs.schema.checks import require
+from configs.validate import ConfigError
 from data.generator import generate_clip
 from data.metrics import Metrics, evaluate
 from data.omomo import find_demo_clips, level_parts, load_mocap, load_omomo
@@ -29,8 +31,6 @@ from data.tracking import Tracker, Tracking
 from sim.robots.spec import available_robots, load_robot
 
 __all__ = ["PHYSICS", "TARGETS", "Column", "main", "measure", "table"]
-
-_USAGE: Final = "usage: python -m data retarget report [number of generated clips, 72 by default] [--physics]\n"
 
 #: Metric, its heading and what the project aims at.
 TARGETS: Final = {
@@ -112,16 +112,30 @@ def table(columns: Sequence[Column]) -> Table:
     return out
 
 
+@dataclass(frozen=True)
+class RetargetReport:
+    """What `python -m proprio_mllm report retarget` takes.
+
+    Attributes:
+        clips: generated clips per robot.
+        physics: say, too, whether the motors of waist and arms can follow.
+    """
+
+    clips: int = 72
+    physics: bool = False
+
+    def __post_init__(self) -> None:
+        require(self.clips > 0, f"clips={self.clips}: at least 1")
+
+
 def main(arguments: Sequence[str]) -> int:
-    """Command line; prints the table, or what is allowed."""
-    if shows_help(arguments, f"{__doc__}\n{_USAGE}"):
-        return 0
-    words = [word for word in arguments if word != "--physics"]
-    if not words or words[0] != "report" or len(words) > 2 or not all(a.isdigit() for a in words[1:]):
-        sys.stderr.write(_USAGE)
+    """Command line; 0 on success, 2 on wrong arguments."""
+    try:
+        options = read_arguments(RetargetReport, arguments)
+    except ConfigError as error:
+        sys.stderr.write(f"{error}\n")
         return 2
-    count = max(1, int(words[1])) if len(words) == 2 else 72
-    physics = "--physics" in arguments
+    count, physics = options.clips, options.physics
     real = [load_omomo(path) for path in find_demo_clips() if path.suffix == ".pt"]
     level = [part for path in find_demo_clips() if path.suffix == ".npy" for part in level_parts(load_mocap(path))]
     columns: list[Column] = []

@@ -1,4 +1,4 @@
-"""Frozen configuration of data collection in the simulator (`python -m sim.collection.collect`)."""
+"""Frozen configuration of data collection in the simulator (`python -m sim collect`)."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ class PlannerConfig:
         history: steps of the log in a backend's prompt.
         body: whether a backend's prompt tells proprioception in words; the paper's baselines have none.
         examples: tasks taken from memory by `llm_planner` and `rap`.
-        memory: folder of the memory, made by `python -m proprio_mllm.planners.memory_build`.
+        memory: folder of the memory, made by `python -m proprio_mllm memory`.
         parallel: whether `dag_plan` may use both arms in one step; false does one node at a time.
     """
 

@@ -1,8 +1,6 @@
 """Backends that answer from recorded replies: one that asks another when there is none, and one that asks nobody.
 
-    python -m proprio_mllm.backends.cache FILE [show=KEY] [export=FILE.jsonl] [import=FILE.jsonl]
-
-lists what a file holds, prints one call, writes all as JSON lines, or takes such lines in. Errors and replies that were cut off
+`python -m proprio_mllm report replies FILE` shows what was recorded. Errors and replies that were cut off
 are never recorded. Paper: none (engineering).
 """
 
@@ -12,7 +10,6 @@ import contextlib
 import dataclasses
 import json
 import logging
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +19,6 @@ from configs.schema.backend import BackendConfig
 from proprio_mllm.backends.identity import identity_in_words, identity_of
 from proprio_mllm.backends.protocol import Backend, BackendError, BackendSetupError, ChatReply, ChatRequest
 from proprio_mllm.backends.replies import ReplyStore, question_of
-from proprio_mllm.backends.transcripts import main
 
 __all__ = ["CachedBackend", "ReplayBackend", "recorded_revision"]
 
@@ -170,7 +166,3 @@ class _Turns:
                     self._waiting[key] = lock, waiting
                 else:
                     del self._waiting[key]
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,6 @@
 """Serves a checkpoint as an OpenAI-compatible model on this machine: `make serve`.
 
-    python -m proprio_mllm.backends.serve [weights=weights/tiny/base] [port=8377] [batch=8] [device=auto] [constrained=false]
+    python -m proprio_mllm serve [weights=weights/tiny/base] [port=8377] [batch=8] [device=auto] [constrained=false]
 
 Prints one line when it is ready; Ctrl-C or SIGTERM ends it after the calls under way. Base URL: http://127.0.0.1:8377/v1.
 
@@ -99,7 +99,3 @@ def main(arguments: Sequence[str]) -> int:
         sys.stdout.flush()
         server.serve_forever()
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

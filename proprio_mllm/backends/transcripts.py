@@ -97,9 +97,9 @@ def import_lines(store: ReplyStore, path: Path) -> tuple[int, int]:
     return len(calls), store.add(calls)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 2 on wrong arguments or files."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    given = list(arguments)
     try:
         if asks_for_help(given):
             sys.stdout.write(f"Recorded replies: {_USAGE}\n\n{_ABOUT}")

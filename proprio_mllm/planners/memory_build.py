@@ -231,12 +231,11 @@ def _write_images(path: Path, vision: str, reader: ShardReader, chosen: Sequence
     return Features(vision, weights_digest(vision), file_hash(path))
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 2 on wrong arguments or what cannot be read."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        config = read_arguments(MemoryConfig, given)
-        memory = build_memory(config, " ".join(["python -m proprio_mllm.planners.memory_build", *given]))
+        config = read_arguments(MemoryConfig, arguments)
+        memory = build_memory(config, " ".join(["python -m proprio_mllm memory", *arguments]))
     except (ConfigError, MemoryFileError, ShardError, SightError) as error:
         sys.stderr.write(f"{error}\n")
         return 2
@@ -247,7 +246,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     facts = f"{found}, {steps} steps, {len(families)} families, {dict(sorted(robots.items()))}"
     sys.stdout.write(f"{config.out}: {facts}\n")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -91,7 +91,7 @@ def compare_runs(a: Run, b: Run) -> RunComparison:
     if a.metadata["robot"] == b.metadata["robot"] and a.robot_config != b.robot_config:
         differing.append(f"robot description: {dict(a.robot_config)} and {dict(b.robot_config)}")
     if a.metadata["robot"] != b.metadata["robot"]:
-        differing.append("two bodies are compared by `python -m proprio_mllm.report gap`")
+        differing.append("two bodies are compared by `python -m proprio_mllm report gap`")
     return _compared("planners", a, b, differing)
 
 

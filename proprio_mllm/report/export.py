@@ -1,4 +1,4 @@
-"""Runs for other tools: `python -m proprio_mllm.report.export RUN [RUN ...] format=sft|jsonl out=FOLDER`.
+"""Runs for other tools: `python -m proprio_mllm report export RUN [RUN ...] format=sft|jsonl out=FOLDER`.
 
 `format=sft` writes a Hugging Face dataset of supervised fine-tuning rows (`proprio_mllm.report.sft`), one per plan step, from
 successful episodes; `format=jsonl` writes `episodes.jsonl`, one episode a line with all that the page of a run shows, and JPEG
@@ -21,9 +21,9 @@ from typing import Any, Final, Literal
 import datasets
 from datasets.arrow_writer import ArrowWriter
 
+from configs.arguments import read_named
 from data.files import file_hash, new_folder, write_text
 from data.interface.episode import Outcome
-from proprio_mllm.report.arguments import read_named
 from proprio_mllm.report.digest import run_digest
 from proprio_mllm.report.frames import ActedOut
 from proprio_mllm.report.html import FrameChoice, run_data
@@ -245,7 +245,3 @@ def main(arguments: Sequence[str]) -> int:
         return 2
     sys.stdout.write(f"{config.out}: {manifest['episodes']} episodes, {manifest['rows']} rows\n")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -1,4 +1,4 @@
-"""Runs as one HTML page: `python -m proprio_mllm.report.html RUN [RUN ...] [out=FILE.html] [frames=all|failed|none]`.
+"""Runs as one HTML page: `python -m proprio_mllm report html RUN [RUN ...] [out=FILE.html] [frames=all|failed|none]`.
 
 The page holds everything itself (style, script, data, pictures as data URIs), so it opens from the file system without a
 network. Its content security policy allows nothing else: no request, and no script but the page's own, known by its hash.
@@ -22,10 +22,10 @@ from typing import Any, Final, Literal
 
 import jinja2
 
+from configs.arguments import read_named
 from configs.validate import ConfigError
 from data.files import write_text
 from data.interface.episode import EpisodeRecord, Outcome
-from proprio_mllm.report.arguments import read_named
 from proprio_mllm.report.digest import episode_digest, run_digest
 from proprio_mllm.report.frames import ActedOut, act_out, episode_id
 from proprio_mllm.report.reenact import Episode, RunTasks, TaskGoneError
@@ -177,7 +177,3 @@ def main(arguments: Sequence[str]) -> int:
     write_text(out, text)
     sys.stdout.write(f"{out}\n")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -1,4 +1,4 @@
-"""One episode as a strip of pictures: `python -m proprio_mllm.report.strip RUN TASK [trial=0] [out=FILE.png]`.
+"""One episode as a strip of pictures: `python -m proprio_mllm report strip RUN TASK [trial=0] [out=FILE.png]`.
 
 The episode is acted out again from its trace, with its own luck, so no planner is needed; a step whose result differs from the
 ledger's is marked. Columns are plan steps: the head view, a view from behind the robot, the plan text and the failure codes.
@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from configs.help import shows_help
+from configs.arguments import read_named
 from proprio_mllm.report.reenact import Reenactment, RunTasks, find_record
 from proprio_mllm.report.runs import Run, load_run
 
@@ -90,27 +90,32 @@ def draw_strip(frames: Sequence[Frame], title: str, path: Path, per_row: int = 8
     return path
 
 
+@dataclass(frozen=True)
+class StripConfig:
+    """What a strip shows.
+
+    Attributes:
+        trial: number of the trial.
+        camera: the camera beside the head's.
+        out: file to write; RUN/strip-TASK-TRIAL.png by default.
+    """
+
+    trial: int = 0
+    camera: str = "behind"
+    out: str = ""
+
+
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 2 on wrong arguments."""
-    if shows_help(arguments, __doc__):
-        return 0
-    options = dict(part.split("=", 1) for part in arguments[2:] if "=" in part)
-    if len(arguments) < 2 or len(options) != len(arguments) - 2 or set(options) - {"trial", "out", "camera"}:
-        sys.stderr.write("usage: python -m proprio_mllm.report.strip RUN TASK [trial=0] [camera=behind] [out=FILE.png]\n")
-        return 2
-    folder, task = Path(arguments[0]), arguments[1]
     try:
-        run, trial = load_run(folder), int(options.get("trial", "0"))
-        record = find_record(run, task, trial)
-        frames = replay(run, task, trial, camera=options.get("camera", "behind"))
+        (folder, task), config = read_named(StripConfig, arguments, ("RUN", "TASK"))
+        run = load_run(Path(folder))
+        record = find_record(run, task, config.trial)
+        frames = replay(run, task, config.trial, camera=config.camera)
     except ValueError as error:
         sys.stderr.write(f"strip: {error}\n")
         return 2
     title = f"{run.title} · {task} · {record.outcome.value}"
-    out = Path(options.get("out", str(folder / f"strip-{task}-{trial}.png")))
+    out = Path(config.out or run.folder / f"strip-{task}-{config.trial}.png")
     sys.stdout.write(f"{draw_strip(frames, title, out)}\n")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

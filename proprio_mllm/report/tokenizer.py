@@ -1,6 +1,6 @@
 """What motion tokenizers keep: one table over tokenizers, and how often each code is used.
 
-    python -m proprio_mllm.report.tokenizer TOKENIZER [TOKENIZER ...] clips=FOLDER [out=FILE.md] [figure=FILE.png]
+    python -m proprio_mllm report tokenizers TOKENIZER [TOKENIZER ...] clips=FOLDER [out=FILE.md] [figure=FILE.png]
 
 A TOKENIZER is a folder that stage `tokenizer` wrote (or `motion/` of released weights), `clips` a folder of `clips` shards, of
 which the held-out ones count. Real clips, the two of OMOMO and the level parts of five climbing captures that `make motions`
@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from configs.arguments import read_named
 from configs.validate import ConfigError
 from data.files import write_text
 from data.joint_angles import JointAngles
@@ -31,7 +32,6 @@ from data.omomo import demo_motions
 from data.retarget import Retargeter
 from data.shards import ShardError
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.report.arguments import read_named
 from proprio_mllm.training.motion_stage import bits_per_s, codebook_use, perplexity, reconstruction_metrics
 from proprio_mllm.training.reconstruction import draw_use
 from proprio_mllm.training.sources import Clips
@@ -210,7 +210,3 @@ def main(arguments: Sequence[str]) -> int:
         lines = [(f"{row.name}, {row.clips}", row.use) for row in rows]
         draw_use(lines).savefig(options.figure, dpi=100)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -1,4 +1,4 @@
-"""One episode as a film: `python -m proprio_mllm.report.video RUN TASK [trial=0] [cameras=[behind,head]] [out=FILE.mp4]`.
+"""One episode as a film: `python -m proprio_mllm report video RUN TASK [trial=0] [cameras=[behind,head]] [out=FILE.mp4]`.
 
 The episode is acted out again from its trace, so no planner is needed. Frames are taken while the skills run; the plan step
 stands below while it is acted out, and what became of it afterwards. A step whose result differs from the ledger's is marked.
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from configs.arguments import read_named
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT
-from proprio_mllm.report.arguments import read_named
 from proprio_mllm.report.reenact import Episode, Reenactment, RunTasks, find_record
 from proprio_mllm.report.runs import load_run
 from sim.tools.video import VideoRecorder, check_film
@@ -92,7 +92,3 @@ def main(arguments: Sequence[str]) -> int:
         return 2
     sys.stdout.write(f"{out}: {frames} frames, {frames / config.fps:.1f} s\n")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

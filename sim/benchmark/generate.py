@@ -1,9 +1,9 @@
 """Generates the benchmark: 359 tasks that the expert has solved on every robot, with budgets from its plans.
 
-    python -m sim.benchmark.generate               # writes benchmark.jsonl and certificates.jsonl
-    python -m sim.benchmark.generate --check       # rebuilds every task from its seed, solves it again, compares bytes
-    python -m sim.benchmark.generate --check-fast  # the same without solving: budgets are taken as they are
-    python -m sim.benchmark.generate --table       # the certificates per family and robot, as Markdown
+    python -m sim benchmark do=generate    # writes benchmark.jsonl and certificates.jsonl
+    python -m sim benchmark do=check       # rebuilds every task from its seed, solves it again, compares bytes
+    python -m sim benchmark do=check_fast  # the same without solving: budgets are taken as they are
+    python -m sim benchmark do=table       # the certificates per family and robot, as Markdown
 
 A slot is a family in a room. Its seeds are tried in order, and those tasks are kept whose certificates say what their category
 promises (`sim.benchmark.certificates`), whose instruction is new, and whose subject has not yet been asked for too often. What
@@ -14,7 +14,6 @@ files, so that it goes on where it was stopped.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import logging
@@ -25,11 +24,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from tqdm import tqdm
 
 import sim
+from configs.arguments import read_arguments
+from configs.validate import ConfigError
 from data.files import write_text
 from data.workers import start_worker
 from sim.benchmark.certificates import (
@@ -303,30 +304,41 @@ def _digest() -> str:
     return digest.hexdigest()[:12]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@dataclass(frozen=True)
+class BenchmarkConfig:
+    """What is done with the benchmark.
+
+    Attributes:
+        do: `check_fast` draws every task again and compares the files, `check` solves them again, too, `table` prints the
+            certificates per family and robot, `generate` writes both files anew.
+        workers: processes of `generate`.
+        tried: folder of what `generate` has tried; outputs/tasks/HASH by default.
+    """
+
+    do: Literal["check_fast", "check", "table", "generate"] = "check_fast"
+    workers: int = 2
+    tried: str = ""
+
+
+def main(arguments: Sequence[str]) -> int:
     """Command line; returns the exit code: 0, 1 when the files differ or slots stay empty, 2 for unknown arguments."""
-    parser = argparse.ArgumentParser(
-        prog="python -m sim.benchmark.generate", description="Generates, or checks, the benchmark."
-    )
-    group = parser.add_mutually_exclusive_group()
-    group.add_argument("--check", action="store_true", help="solve every task again and compare the files")
-    group.add_argument("--check-fast", action="store_true", help="draw every task again and compare the files")
-    group.add_argument("--table", action="store_true", help="print the certificates per family and robot")
-    parser.add_argument("--workers", type=int, default=2, help="processes")
-    parser.add_argument("--tried", type=Path, default=None, help="folder of what has been tried; outputs/tasks/HASH by default")
-    options = parser.parse_args(arguments)
+    try:
+        options = read_arguments(BenchmarkConfig, arguments)
+    except ConfigError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    if options.table:
+    if options.do == "table":
         sys.stdout.write(certificates_table(load_benchmark(), load_certificates()))
         return 0
-    if options.check or options.check_fast:
-        problems = list(_check(solve=options.check))
+    if options.do in ("check", "check_fast"):
+        problems = list(_check(solve=options.do == "check"))
         sys.stdout.write(json.dumps(counts(load_benchmark())) + "\n")
         for problem in problems:
             sys.stderr.write(problem + "\n")
         return int(bool(problems))
     try:
-        tasks, certificates = generate(options.tried or Path("outputs/tasks") / _digest(), options.workers)
+        tasks, certificates = generate(Path(options.tried or Path("outputs/tasks") / _digest()), options.workers)
     except RuntimeError as error:
         sys.stderr.write(f"{error}\n")
         return 1
@@ -334,7 +346,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     write_text(CERTIFICATES_PATH, certificates_text(certificates))
     sys.stdout.write(json.dumps(counts(tasks)) + "\n")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,7 @@
 """Collects training shards: posed views and demonstrations of the expert from the simulator, and exercises in words.
 
-    python -m sim.collection.collect kind=views out=outputs/views count=4800 workers=2
-    python -m sim.collection.collect kind=demos out=outputs/demos count=600 workers=2
+    python -m sim collect kind=views out=outputs/views count=4800 workers=2
+    python -m sim collect kind=demos out=outputs/demos count=600 workers=2
 
 A part file is a function of the configuration and its index only, so runs may be interrupted, resumed and spread over processes
 without changing a byte. Paper: the planning demonstrations and views that the open stages train on; the paper starts from
@@ -129,10 +129,10 @@ def _with_bar(run: Callable[[Callable[[int, int], None]], Manifest], title: str)
         return run(lambda done, total: bar.update(task, completed=done, total=total))
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Command line; returns the exit code."""
     try:
-        config = read_arguments(CollectConfig, sys.argv[1:] if arguments is None else arguments)
+        config = read_arguments(CollectConfig, arguments)
     except ConfigError as error:
         sys.stderr.write(f"{error}\n")
         return 2
@@ -140,7 +140,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     facts: Mapping[str, Any] = {"rows": manifest.rows, "parts": len(manifest.parts), "config_hash": manifest.config_hash}
     sys.stdout.write(f"{config.out}: {facts}\n")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

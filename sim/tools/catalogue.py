@@ -1,20 +1,21 @@
-"""Lists types, rooms, robots, actions, failure codes and cameras: `python -m sim.tools.catalogue [--json]`.
+"""Lists types, rooms, robots, actions, failure codes and cameras: `python -m sim catalogue [json=true]`.
 
 The user's own assets (`configs.assets`) are included. The JSON has the same entries with every field, and counts.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from configs.arguments import read_arguments
 from configs.validate import ConfigError
 from data.interface.actions import ACTIONS
 from data.interface.failures import FAILURES
@@ -144,12 +145,21 @@ def _print(parts: Mapping[str, Any], console: Console) -> None:
         console.print(table)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@dataclass(frozen=True)
+class CatalogueConfig:
+    """How the catalogue is printed.
+
+    Attributes:
+        json: one JSON object with every field and counts, in place of tables.
+    """
+
+    json: bool = False
+
+
+def main(arguments: Sequence[str]) -> int:
     """Prints the inventory; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m sim.tools.catalogue", description=__doc__)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    wanted = parser.parse_args(arguments)
     try:
+        wanted = read_arguments(CatalogueConfig, arguments)
         parts = inventory()
     except ConfigError as error:
         sys.stderr.write(f"{error}\n")
@@ -159,7 +169,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     else:
         _print(parts, Console(width=None if sys.stdout.isatty() else 160))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

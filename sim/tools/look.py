@@ -1,4 +1,4 @@
-"""Pictures of rooms, object types and robots, for the eye: `python -m sim.tools.look [folder]`.
+"""Pictures of rooms, object types and robots, for the eye: `python -m sim look [out=outputs/look]`.
 
 Writes each room from above and through the robot's head camera, a contact sheet of the types, their lids, and each robot
 standing, crouching and holding a plant with both hands. Not part of any experiment.
@@ -6,7 +6,9 @@ standing, crouching and holding a plant with both hands. Not part of any experim
 
 from __future__ import annotations
 
-import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -14,9 +16,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from configs.arguments import read_arguments
+from configs.validate import ConfigError
 from data.interface.steps import Action, PlanStep
 from sim.expert.expert import Expert
-from sim.robots.spec import load_robot
+from sim.robots.spec import available_robots, load_robot
 from sim.scene.catalogue import load_catalogue
 from sim.scene.compiler import build_type_spec
 from sim.scene.rooms import room_names
@@ -114,7 +118,7 @@ def _tile(type_name: str, size: int, openness: float | None = None) -> NDArray[n
         return renderer.render().copy()
 
 
-def main(folder: Path) -> list[Path]:
+def draw_all(folder: Path) -> list[Path]:
     """Writes all pictures and returns their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     sheet = folder / "types.png"
@@ -122,14 +126,30 @@ def main(folder: Path) -> list[Path]:
     iio.imwrite(folder / "lids.png", lid_sheet())
     iio.imwrite(folder / "rooms.png", room_sheet())
     written = [sheet, folder / "lids.png", folder / "rooms.png", *room_pictures(folder)]
-    for robot in ("h1", "x1"):
+    for robot in available_robots():
         written.append(folder / f"{robot}_poses.png")
         iio.imwrite(written[-1], robot_poses(robot))
     return written
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser("python -m sim.tools.look", description=__doc__)
-    parser.add_argument("folder", nargs="?", type=Path, default=Path("outputs/look"))
-    for written in main(parser.parse_args().folder):
-        print(written)  # noqa: T201 this is what the command is for
+@dataclass(frozen=True)
+class LookConfig:
+    """Where the pictures go.
+
+    Attributes:
+        out: folder.
+    """
+
+    out: str = "outputs/look"
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Command line; 0 on success, 2 on wrong arguments."""
+    try:
+        config = read_arguments(LookConfig, arguments)
+    except ConfigError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    for written in draw_all(Path(config.out)):
+        sys.stdout.write(f"{written}\n")
+    return 0

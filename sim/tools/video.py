@@ -1,4 +1,4 @@
-"""Video of an episode: `python -m sim.tools.video out=pick.mp4 robot=h1 plan='[GoTo(Mug_1), "Pick(left, Mug_1)"]'`.
+"""Video of an episode: `python -m sim video out=pick.mp4 robot=h1 plan='[GoTo(Mug_1), "Pick(left, Mug_1)"]'`.
 
 Frames are taken between control ticks while skills run, so motion is smooth; the step and what became of it are written below.
 With `task=ID` and no plan the expert acts. The file is written under a temporary name and renamed when it is complete. Encoding
@@ -206,17 +206,13 @@ def _act(session: Session, step: PlanStep, video: VideoRecorder) -> bool:
     return feedback.success
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Command line; returns 0 when every step succeeded, 1 when one failed, 2 on wrong arguments."""
     try:
-        config = read_arguments(VideoConfig, sys.argv[1:] if arguments is None else arguments)
+        config = read_arguments(VideoConfig, arguments)
         frames, fine = film(config)
     except (ConfigError, ActionError, ValueError) as error:
         sys.stderr.write(f"{error}\n")
         return 2
     sys.stdout.write(f"{config.out}: {frames} frames, {frames / config.fps:.1f} s{'' if fine else ', a step failed'}\n")
     return 0 if fine else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 @contextlib.contextmanager
 def command() -> Iterator[subprocess.Popen[str]]:
     """The command, on a free port."""
-    call = [sys.executable, "-m", "proprio_mllm.backends.serve", "port=0", "device=cpu"]
+    call = [sys.executable, "-m", "proprio_mllm", "serve", "port=0", "device=cpu"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs, and so theirs, ignore it
     with subprocess.Popen(

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from proprio_mllm.backends.cache import CachedBackend, ReplayBackend, main
+from proprio_mllm.backends.cache import CachedBackend, ReplayBackend
 from proprio_mllm.backends.protocol import ChatReply
 from proprio_mllm.backends.replies import question_of
+from proprio_mllm.backends.transcripts import main
 from tests.backends.loopback import IMAGE, ROOT, Answering, ask, finished, started
 
 
@@ -147,6 +148,6 @@ def test_a_reader_that_has_seen_enough_is_no_error(path: Path, arguments: list[s
 
 
 def test_as_a_program(path: Path) -> None:
-    code = "import runpy, sys\nsys.argv[0] = 'cache'\nrunpy.run_module('proprio_mllm.backends.cache', run_name='__main__')"
+    code = "import runpy, sys\nsys.argv[1:1] = ['report', 'replies']\nrunpy.run_module('proprio_mllm', run_name='__main__')"
     (written,) = finished(started(code, path))
     assert len(written.splitlines()) == 2

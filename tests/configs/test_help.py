@@ -77,7 +77,7 @@ def test_reports_have_a_help_without_a_run(capsys: pytest.CaptureFixture[str]) -
         export_main(["--help"])
     assert end.value.code == 0
     said = capsys.readouterr().out
-    assert said.startswith("Runs for other tools: `python -m proprio_mllm.report.export RUN [RUN ...] format=sft|jsonl")
+    assert said.startswith("Runs for other tools: `python -m proprio_mllm report export RUN [RUN ...] format=sft|jsonl")
     assert re.search(r"^  format=… ", said, re.M)
 
 

@@ -33,7 +33,7 @@ def test_table_of_a_humanml3d_folder(tmp_path: Path, capsys: pytest.CaptureFixtu
     (tmp_path / "train.txt").write_text("\n".join(ALL))
     (tmp_path / "val.txt").write_text("\n".join(f"M{name}" for name in ALL[:3]))
     (tmp_path / "test.txt").write_text("")
-    assert main(["table", str(tmp_path)]) == 0
+    assert main([str(tmp_path)]) == 0
     lines = [line.replace("│", " ").split() for line in capsys.readouterr().out.splitlines()]
     assert ["in", "the", "lists", "14,616", "3"] in lines
     assert ["kept", "11,955", "2"] in lines
@@ -54,7 +54,7 @@ def test_table_of_shards(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         "clips": 6, "unusable": 1, "PHC list: no_amass_key": 1, "retargeted": 4, "truncated": int(cut),
     }  # fmt: skip
     assert shard_counts(manifest)["x1"] == {"leg_deg": 4, "kept": 0}
-    assert main(["table", str(tmp_path / "clips")]) == 0
+    assert main([str(tmp_path / "clips")]) == 0
     lines = [line.replace("│", " ").split() for line in capsys.readouterr().out.splitlines()]
     assert ["dropped", "by", "gate:", "leg_deg", "4"] in lines
     assert ["kept", "0"] in lines
@@ -62,9 +62,9 @@ def test_table_of_shards(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["tables"]) == 2
-    assert "usage: python -m data filter table" in capsys.readouterr().err
-    assert main(["table", str(tmp_path)]) == 1
+    assert main([]) == 2
+    assert "usage: python -m proprio_mllm report filter" in capsys.readouterr().err
+    assert main([str(tmp_path)]) == 1
     assert "new_joints" in capsys.readouterr().err
     with pytest.raises(ShardError, match="'views' without counts"):
         shard_counts(Manifest("views", "x", True, {}, {}))

@@ -195,10 +195,10 @@ def test_admission() -> None:
 
 def test_report_usage(capsys: pytest.CaptureFixture[str]) -> None:
     assert report(["table"]) == 2
-    assert "usage" in capsys.readouterr().err
-    assert report(["--physics"]) == 2
-    assert "[--physics]" in capsys.readouterr().err
-    assert report(["report", "1"]) == 0
+    assert "'table' is not key=value" in capsys.readouterr().err
+    assert report(["clips=0"]) == 2
+    assert "clips=0: at least 1" in capsys.readouterr().err
+    assert report(["clips=1"]) == 0
     out = capsys.readouterr().out
     assert "skate_cm_s" in out and "physics" not in out
 

@@ -172,9 +172,7 @@ def test_pictures_have_to_be_those_of_the_memory(memory_folder: Path, tmp_path: 
 
 
 def test_no_memory_names_the_command(tmp_path: Path) -> None:
-    with pytest.raises(
-        MemoryFileError, match=r"no memory at .*nothing: make it with `python -m proprio_mllm.planners.memory_build`"
-    ):
+    with pytest.raises(MemoryFileError, match=r"no memory at .*nothing: make it with `python -m proprio_mllm memory`"):
         check_memory(tmp_path / "nothing")
 
 
@@ -219,7 +217,7 @@ def test_a_stopped_build_leaves_the_old_memory(
 def test_the_command_line(demos_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([f"demos={demos_folder}", f"out={tmp_path / 'm'}", "limit=3", "vision=null"]) == 0
     assert "3 episodes" in capsys.readouterr().out
-    assert read_memory(tmp_path / "m").header.command.startswith("python -m proprio_mllm.planners.memory_build demos=")
+    assert read_memory(tmp_path / "m").header.command.startswith("python -m proprio_mllm memory demos=")
     for wrong, message in [
         ("limit=0", "limit 0 must be positive or null"),
         ("seed=-1", "seed -1 must not be negative"),

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from proprio_mllm.report.__main__ import main
+from proprio_mllm.report.commands import main
 from proprio_mllm.report.comparison import compare_bodies, compare_runs, comparison_table
 from proprio_mllm.report.stored import load_run
 
@@ -119,18 +119,18 @@ def test_command_line(pair, capsys, tmp_path) -> None:
     printed = capsys.readouterr().out
     assert "lost, A (h1) succeeds less often: t09, t10, t11." in printed
     assert "+33.3" in printed
-    assert main(["compare", *folders, "--json"]) == 0
+    assert main(["compare", *folders, "json=true"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["rows"]["all"]["success"]["below"] == ["t09", "t10", "t11"]
     assert len(told["episodes"]) == 12
     assert told["episodes"][0]["steps"] == [4.0, 6.0]
     for ending, start in ((".md", "**A (h1)"), (".csv", "category,"), (".tex", "% needs"), (".json", "{")):
         path = tmp_path / "out" / f"table{ending}"
-        assert main(["compare", *folders, "--out", str(path)]) == 0
+        assert main(["compare", *folders, f"out={path}"]) == 0
         assert path.read_text().startswith(start)
     capsys.readouterr()
-    assert main(["compare", *folders, "--out", "table.pdf"]) == 2
-    assert "'.pdf' is not allowed; allowed: .md, .csv, .tex, .json" in capsys.readouterr().err
+    assert main(["compare", *folders, "out=table.pdf"]) == 2
+    assert "out=table.pdf: endings are .md, .csv, .tex, .json" in capsys.readouterr().err
     assert main(["gap", *folders]) == 2
     assert "a gap needs two bodies" in capsys.readouterr().err
     assert main(["compare", str(tmp_path), folders[0]]) == 2

@@ -1,7 +1,7 @@
 """The Controller over HTTP: for planners that run in another process, on another machine, or in another language.
 
-    python -m sim.interfaces.remote                                   # http://127.0.0.1:8265, this machine only
-    DUALTHOR_TOKEN=... python -m sim.interfaces.remote host=0.0.0.0   # elsewhere too; the token is required then
+    python -m sim serve                                   # http://127.0.0.1:8265, this machine only
+    DUALTHOR_TOKEN=... python -m sim serve host=0.0.0.0   # elsewhere too; the token is required then
 
 Every client gets a world of its own in a process of its own, so that nothing a client does reaches another. A world that has
 not been asked for a while is closed, and the number of worlds is limited. Requests and replies are JSON:

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from sim.interfaces.controller import Controller
-from sim.interfaces.remote.__main__ import main
 from sim.interfaces.remote.client import RemoteController, RemoteError
 from sim.interfaces.remote.protocol import ProtocolError, loads
+from sim.interfaces.remote.serve import main
 from sim.interfaces.remote.server import RemoteServer, ServerConfig, is_loopback
 
 TOKEN = "a token for the tests"

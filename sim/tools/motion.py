@@ -1,8 +1,8 @@
 """Films of retargeting: the human skeleton beside each robot, every frame of a clip, for a person to look at.
 
-    python -m sim.tools.motion_film 2 9 [--robots h1 x1] [--out outputs/films]      # numbers of generated clips
-    python -m sim.tools.motion_film 000021 --dataset HumanML3D                      # ids of a folder in that format
-    python -m sim.tools.motion_film walk_poses.npz --body-models models             # files: .npz (AMASS), .pt, .npy
+    python -m sim motion 2 9 robots=[h1,x1] out=outputs/films    # numbers of generated clips
+    python -m sim motion 000021 dataset=HumanML3D                # ids of a folder in that format
+    python -m sim motion walk_poses.npz body_models=models       # files: .npz (AMASS), .pt, .npy
 
 All panels have the same scale and time; each camera goes along with its figure, and squares of half a metre on the floor show
 how far it walks. Left limbs of the human are red. Robots are shown as retargeted: no gate is applied, nothing is simulated.
@@ -12,10 +12,10 @@ Paper: none; to look at what the numbers cannot show.
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,6 +26,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter1d
 
+from configs.arguments import read_named
+from configs.schema.checks import require
+from configs.validate import ConfigError, allowed_values
 from data.generator import generate_clip
 from data.humanml3d import DatasetError, load_clip
 from data.motion import FPS
@@ -33,7 +36,6 @@ from data.retarget import Retargeter
 from data.skeleton import JOINTS, PARENTS, HumanMotion, index
 from data.sources import SUFFIXES, load_file
 from sim.robots.spec import available_robots, load_robot
-from sim.tools.motion_look import stage
 
 __all__ = ["film", "find_clip", "main", "title_lines"]
 
@@ -52,6 +54,39 @@ _BONE_M: Final = 0.035
 _HEAD_M: Final = 0.10
 
 
+#: Half the width of what a camera sees, metres.
+_EXTENT_M: Final = 2.5
+
+
+def stage(mjcf: Path | None = None, chequered: bool = False) -> mujoco.MjModel:
+    """A lit floor below a plain sky, with the robot of an MJCF file; chequered in squares of half a metre on demand."""
+    spec = mujoco.MjSpec() if mjcf is None else mujoco.MjSpec.from_file(str(mjcf))
+    floor = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[4, 4, 0.1], rgba=[0.8, 0.8, 0.8, 1])
+    if chequered:
+        spec.add_texture(
+            name="squares", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+            width=64, height=64, rgb1=[0.80, 0.82, 0.84], rgb2=[0.66, 0.69, 0.72],
+        )  # fmt: skip
+        textures = [""] * int(mujoco.mjtTextureRole.mjNTEXROLE)
+        textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = "squares"
+        spec.add_material(name="squares", textures=textures, texrepeat=[1.0, 1.0], texuniform=True)
+        stat: Any = spec.stat
+        stat.extent = _EXTENT_M  # the same haze at the horizon for every figure
+        floor.material, floor.size, floor.rgba = "squares", [0.0, 0.0, 0.1], [1.0, 1.0, 1.0, 1.0]
+    spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        width=32, height=32, rgb1=[0.93, 0.94, 0.96],
+    )  # fmt: skip
+    for side in (-1.0, 1.0):
+        spec.worldbody.add_light(
+            pos=[3.0, 2.0 * side, 3.0],
+            dir=[-0.7, -0.5 * side, -0.6],
+            type=int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL),
+            castshadow=False,
+        )
+    return spec.compile()
+
+
 def find_clip(name: str, dataset: Path | None, body_models: Path | None) -> HumanMotion:
     """A clip by what a person types: a file, an id of a folder in HumanML3D's format, or the number of a generated clip.
 
@@ -65,7 +100,7 @@ def find_clip(name: str, dataset: Path | None, body_models: Path | None) -> Huma
     if name.isdigit():
         return generate_clip(0, int(name))
     raise DatasetError(
-        f"{name!r}: neither the number of a generated clip nor a file ({', '.join(SUFFIXES['folder'])}); an id needs --dataset"
+        f"{name!r}: neither a generated clip's number nor a file ({', '.join(SUFFIXES['folder'])}); an id needs dataset=FOLDER"
     )
 
 
@@ -210,27 +245,46 @@ def _caption(clip: HumanMotion, time_s: float) -> str:
     return next(iter((*now, *whole)), "(no caption)")
 
 
+@dataclass(frozen=True)
+class MotionConfig:
+    """How a clip is filmed.
+
+    Attributes:
+        robots: robots beside the human; all by default.
+        out: folder of the films.
+        dataset: folder in HumanML3D's format, for clips named by id.
+        body_models: folder of SMPL models, for .npz files.
+    """
+
+    robots: tuple[str, ...] = ()
+    out: str = "outputs/films"
+    dataset: str = ""
+    body_models: str = ""
+
+    def __post_init__(self) -> None:
+        for name in self.robots:
+            require(name in available_robots(), f"robots: {allowed_values(name, available_robots())}")
+
+
 def main(arguments: Sequence[str]) -> int:
-    """Command line; 0 on success, 1 when a clip cannot be used."""
-    parser = argparse.ArgumentParser("python -m sim.tools.motion_film", description="Films of retargeted clips.")
-    parser.add_argument("clips", nargs="+", metavar="CLIP", help="number of a generated clip, an id with --dataset, or a file")
-    parser.add_argument("--robots", nargs="+", choices=available_robots(), default=["h1", "x1"])
-    parser.add_argument("--out", type=Path, default=Path("outputs/films"))
-    parser.add_argument("--dataset", type=Path, help="folder in HumanML3D's format")
-    parser.add_argument("--body-models", type=Path, help="folder of SMPL models, for .npz")
-    args = parser.parse_args(arguments)
-    retargeters = [Retargeter(load_robot(name)) for name in args.robots]
-    for name in args.clips:
+    """Command line; 0 on success, 1 when a clip cannot be used, 2 on wrong arguments."""
+    try:
+        names, config = read_named(MotionConfig, arguments, ("CLIP",), more=True)
+    except ConfigError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    retargeters = [Retargeter(load_robot(name)) for name in config.robots or available_robots()]
+    for name in names:
         try:
-            clip = find_clip(name, args.dataset, args.body_models)
+            clip = find_clip(name, _folder(config.dataset), _folder(config.body_models))
         except DatasetError as error:
             sys.stderr.write(f"{error}\n")
             return 1
-        path = args.out / f"motion_{Path(clip.name).name}.mp4"
+        path = Path(config.out) / f"motion_{Path(clip.name).name}.mp4"
         sys.stdout.write(f"{path}: {film(clip, retargeters, path)} frames\n")
         sys.stdout.flush()
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+def _folder(name: str) -> Path | None:
+    return Path(name) if name else None

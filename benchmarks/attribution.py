@@ -1,8 +1,8 @@
 """How well the failure types name the true reason: scripted episodes with a known mistake, and what the rule makes of them.
 
-    python -m proprio_mllm.report.validation robot=all seed=1 workers=2 out=outputs/validation
+    python -m benchmarks.attribution robot=all seed=1 workers=2 out=outputs/validation
 
-The episodes (`proprio_mllm.evaluation.scripted`) are acted out in the simulator; agreement gets Wilson's interval over
+The episodes (`benchmarks.fault_episodes`) are acted out in the simulator; agreement gets Wilson's interval over
 episodes, and the confusion matrix has the true type in its rows. Exit code 0; 1 when fewer than 95 % agree, a flag is wrong or
 too few episodes count; 2 on wrong arguments.
 
@@ -22,13 +22,13 @@ from typing import Any, Final, Literal
 
 from rich.progress import Progress
 
+from benchmarks.fault_episodes import Cell, CellRunner, ScriptedResult, cells
 from configs.arguments import read_arguments
 from configs.validate import ConfigError
 from data.files import write_text
 from data.interface.episode import Outcome
 from data.interface.failures import FailureCategory
 from proprio_mllm.evaluation.pool import run_jobs
-from proprio_mllm.evaluation.scripted import Cell, CellRunner, ScriptedResult, cells
 from proprio_mllm.report.statistics import wilson
 from proprio_mllm.report.summary import write_json
 from proprio_mllm.report.table import Table

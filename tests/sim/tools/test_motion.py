@@ -14,7 +14,7 @@ from data.generator import generate_clip, write_dataset
 from data.humanml3d import DatasetError
 from data.retarget import Retargeter
 from sim.robots.spec import load_robot
-from sim.tools.motion_film import film, find_clip, main, title_lines
+from sim.tools.motion import film, find_clip, main, title_lines
 
 
 def test_every_frame_is_filmed_with_ground_and_figures(tmp_path: Path) -> None:
@@ -41,9 +41,9 @@ def test_clips_by_number_id_and_file(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert find_clip("000001", folder, None).captions == generate_clip(5, 1).captions
     with pytest.raises(DatasetError, match="not a readable array"):
         find_clip(str(tmp_path / "none.npy"), None, None)
-    with pytest.raises(DatasetError, match="'walk': neither the number"):
+    with pytest.raises(DatasetError, match="'walk': neither a generated clip's number"):
         find_clip("walk", None, None)
-    assert main(["walk", "--robots", "x1", "--out", str(tmp_path)]) == 1
+    assert main(["walk", "robots=[x1]", f"out={tmp_path}"]) == 1
     assert "'walk'" in capsys.readouterr().err
 
 

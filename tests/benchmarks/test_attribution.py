@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import attribution as validation
+from benchmarks.attribution import main, validate
+from benchmarks.fault_episodes import Scripted, ScriptedResult
 from data.interface.episode import EpisodeRecord, Outcome
 from data.interface.failures import FailureCategory
-from proprio_mllm.evaluation.scripted import Scripted, ScriptedResult
-from proprio_mllm.report import validation
-from proprio_mllm.report.validation import main, validate
 
 NAVIGATION, BODY, LOGICAL = FailureCategory
 

@@ -8,15 +8,15 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from benchmarks.attribution import validate
+from benchmarks.fault_episodes import Cell, CellRunner, cells, drawn, read_plans
+from benchmarks.fault_injection import CAUSES, LATE_SLIPS, SLIPS, FaultyPlanner
 from data.interface.actions import ActionKind
 from data.interface.episode import Outcome
 from data.interface.failures import FailureCategory
 from data.interface.steps import PlanStep
-from proprio_mllm.evaluation.fault_injection import CAUSES, LATE_SLIPS, SLIPS, FaultyPlanner
 from proprio_mllm.evaluation.privileged import PrivilegedPlanner
-from proprio_mllm.evaluation.scripted import Cell, CellRunner, cells, drawn, read_plans
 from proprio_mllm.planners.protocol import Planner, TaskInfo
-from proprio_mllm.report.validation import validate
 from sim.tasks.task import load_benchmark
 
 TASKS = load_benchmark()

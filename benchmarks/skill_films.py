@@ -1,4 +1,4 @@
-"""Films each skill by each robot, with a strip of stills: `python -m sim.tools.films [folder] [scene ...]`.
+"""Films each skill by each robot, with a strip of stills: `python -m benchmarks.skill_films [folder] [scene ...]`.
 
 Where only the pelvis height is wrong for a step it is put right first, as the failure's margin says. Not part of any
 experiment.
@@ -144,7 +144,7 @@ def main(folder: Path, names: Sequence[str] = tuple(SCENES)) -> int:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser("python -m sim.tools.films", description=__doc__)
+    parser = argparse.ArgumentParser("python -m benchmarks.skill_films", description=__doc__)
     parser.add_argument("folder", nargs="?", type=Path, default=Path("outputs/films"))
     parser.add_argument("scene", nargs="*", help=f"of {', '.join(SCENES)}; all by default")
     arguments = parser.parse_args()

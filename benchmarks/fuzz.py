@@ -1,4 +1,4 @@
-"""Random calls of the Controller, a third of them malformed: `python -m sim.tools.fuzz actions=100000 seed=0 [workers=2]`.
+"""Random calls of the Controller, a third of them malformed: `python -m benchmarks.fuzz actions=100000 seed=0 [workers=2]`.
 
 Every call must end in a well-formed event or in ValueError. After each one the world is checked: finite physics, every object
 there once and within the room, liquid conserved, holders that agree with the grasps, joints within their limits, states within

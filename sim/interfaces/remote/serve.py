@@ -1,4 +1,4 @@
-"""`python -m sim.interfaces.remote [host=... port=... worlds=... idle_s=...]`: serves until interrupted."""
+"""`python -m sim serve [host=... port=... worlds=... idle_s=...]`: serves until interrupted."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ __all__ = ["TOKEN_VARIABLE", "main"]
 TOKEN_VARIABLE: Final = "DUALTHOR_TOKEN"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Command line; returns the exit code."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     try:
-        config = read_arguments(ServerConfig, sys.argv[1:] if arguments is None else arguments)
+        config = read_arguments(ServerConfig, arguments)
         server = RemoteServer(config, os.environ.get(TOKEN_VARIABLE) or None)
     except (ConfigError, OSError) as error:
         sys.stderr.write(f"{error}\n")
@@ -37,7 +37,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sys.stdout.flush()
     server.serve()
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -16,13 +16,13 @@ from typing import Final
 
 import numpy as np
 
+from benchmarks.fault_injection import CAUSES, LATE_SLIPS, SLIPS, Cause, FaultyPlanner
 from configs.schema.robot import RobotConfig
 from data.interface.actions import ACTIONS, ActionKind
 from data.interface.episode import EpisodeRecord, Outcome
 from data.interface.failures import FailureCategory
 from data.interface.steps import PlanStep
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, RunnableSession, run_episode
-from proprio_mllm.evaluation.fault_injection import CAUSES, LATE_SLIPS, SLIPS, Cause, FaultyPlanner
 from proprio_mllm.evaluation.seeds import episode_seed, stream
 from proprio_mllm.evaluation.sessions import open_session
 from sim.tasks.task import BENCHMARK_PATH, Task, load_benchmark

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.fuzz import FuzzConfig, calls, check, main, run_world
 from sim.interfaces.controller import Controller
-from sim.tools.fuzz import FuzzConfig, calls, check, main, run_world
 
 
 def test_a_short_run_is_clean(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""`python -m sim.tools.catalogue`: what it lists is what exists."""
+"""`python -m sim catalogue`: what it lists is what exists."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sim.tools.catalogue import main
 
 
 def test_json_lists_everything_with_counts(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--json"]) == 0
+    assert main(["json=true"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["counts"]["types"] == 68 and found["counts"]["rooms"] == 10
     assert [row["name"] for row in found["robots"]] == ["h1", "x1"]

@@ -1,0 +1,23 @@
+"""Commands of the simulator: `python -m sim` lists them."""
+
+from __future__ import annotations
+
+import sys
+from typing import Final
+
+from configs.arguments import dispatch
+
+__all__ = ["COMMANDS"]
+
+COMMANDS: Final = {
+    "look": ("sim.tools.look", "pictures of rooms, object types and robots"),
+    "catalogue": ("sim.tools.catalogue", "types, rooms, robots, actions, failure codes and cameras, as a list or JSON"),
+    "video": ("sim.tools.video", "film of an episode that you or the expert plan"),
+    "motion": ("sim.tools.motion", "film of a human clip beside the robots that it was retargeted to"),
+    "collect": ("sim.collection.collect", "shards to train on: views, demonstrations, planning in words"),
+    "benchmark": ("sim.benchmark.generate", "the 359 tasks: check, generate, or tabulate them"),
+    "serve": ("sim.interfaces.remote.serve", "the Controller over HTTP"),
+}
+
+if __name__ == "__main__":
+    sys.exit(dispatch("python -m sim", COMMANDS, sys.argv[1:]))
