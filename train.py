@@ -1,7 +1,7 @@
 """Trains Proprio-MLLM: `python train.py stage=all model=tiny` (paper, three stages; `stage=base` stands in for pretraining).
 
-Stages: data (motions to clips shards), collect (views, exercises, demonstrations), base, corrections (the base model acts, the
-expert corrects it), pointmap, tokenizer, alignment, selu; `all` runs them in order and skips what is current. Options are
+Stages: data (motions to clips shards), collect (views, planning in words, demonstrations), base, dagger (the base model acts,
+the expert corrects it), pointmap, tokenizer, alignment, selu; `all` runs them in order and skips what is current. Options are
 documented in configs/schema/train.py.
 """
 
@@ -40,11 +40,11 @@ def make_shards(cfg: TrainConfig) -> None:
     from proprio_mllm.training.paths import StagePaths
     from sim.collection.collect import collect
 
-    wanted: tuple[tuple[Literal["views", "exercises", "judgements", "demos"], int, int], ...]
+    wanted: tuple[tuple[Literal["views", "text_planning", "goal_questions", "demos"], int, int], ...]
     wanted = (
         ("views", cfg.collect.views, 240),
-        ("exercises", cfg.collect.exercises, 1000),
-        ("judgements", cfg.collect.exercises, 1000),
+        ("text_planning", cfg.collect.text_planning, 1000),
+        ("goal_questions", cfg.collect.text_planning, 1000),
         ("demos", cfg.collect.episodes, 10),
     )
     for kind, count, part in wanted:
@@ -86,7 +86,7 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
     command = " ".join(["python train.py", *sys.argv[1:]])
-    pipeline = Pipeline(STAGES, cfg, _rollouts, command, _corrections)
+    pipeline = Pipeline(STAGES, cfg, _rollouts, command, _dagger)
     wanted = tuple(STAGES) if cfg.stage == "all" else (cfg.stage,)
     metrics = {name: pipeline.run(name) for name in wanted}
     if cfg.release is not None:
@@ -106,11 +106,11 @@ def _rollouts(*args: Any, **kwargs: Any) -> Any:
     return collect_rollouts(*args, **kwargs)
 
 
-def _corrections(*args: Any, **kwargs: Any) -> Any:
+def _dagger(*args: Any, **kwargs: Any) -> Any:
     """The base model acts in the simulator and the expert corrects it; training reads the shards."""
-    from proprio_mllm.evaluation.dagger import collect_corrections
+    from proprio_mllm.evaluation.dagger import collect_dagger
 
-    return collect_corrections(*args, **kwargs)
+    return collect_dagger(*args, **kwargs)
 
 
 def job(cfg: TrainConfig) -> int:

@@ -21,7 +21,7 @@ import torch
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import load_model
 from proprio_mllm.model.modeling import ProprioMLLM
-from proprio_mllm.training.sources import Demos, Exercises
+from proprio_mllm.training.sources import Demos, TextPlanning
 
 PARTS = (1, 2, 3, 4)
 
@@ -45,10 +45,10 @@ def main() -> int:
     torch.set_num_threads(args.threads)
     model = load_model(args.output / "shared" / "base" / "model", trainable=True).train()
     demos = Demos(args.output / "data" / "demos", model.cfg)
-    exercises = Exercises(args.output / "data" / "exercises", model.cfg, demos)
+    text_planning = TextPlanning(args.output / "data" / "text_planning", model.cfg, demos)
     collator, rng = Collator(model.processor, model.cfg), np.random.default_rng(0)
     kinds: dict[str, Callable[[], list[Example]]] = {
-        "exercises": lambda: [exercises.draw(rng) for _ in range(args.batch)],
+        "text_planning": lambda: [text_planning.draw(rng) for _ in range(args.batch)],
         "planning": lambda: [demos.example(int(i), None) for i in demos.draw(rng, args.batch)],
     }
     for name, draw in kinds.items():

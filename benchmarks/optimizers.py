@@ -24,7 +24,7 @@ from proprio_mllm.model.building import build_model, load_model
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.training.loop import learning_rate, make_optimizer
-from proprio_mllm.training.sources import Demos, Exercises, Views
+from proprio_mllm.training.sources import Demos, TextPlanning, Views
 from proprio_mllm.training.text import start_from_words
 
 _HELD_OUT: Final = 300
@@ -77,14 +77,14 @@ def main() -> int:
     torch.set_num_threads(args.threads)
     runs = [Run(args.output, "adamw", args), Run(args.output, "muon", args)]
     cfg = runs[0].model.cfg
-    exercises = Exercises(args.output / "data" / "exercises", cfg, Demos(args.output / "data" / "demos", cfg))
+    text_planning = TextPlanning(args.output / "data" / "text_planning", cfg, Demos(args.output / "data" / "demos", cfg))
     collator = Collator(runs[0].model.processor, cfg)
-    stride = max(1, len(exercises.test) // _HELD_OUT)
-    asked = [exercises.example(int(i), np.random.default_rng(0)) for i in exercises.test[::stride]]
+    stride = max(1, len(text_planning.test) // _HELD_OUT)
+    asked = [text_planning.example(int(i), np.random.default_rng(0)) for i in text_planning.test[::stride]]
     held_out = [collator(asked[i : i + _CHUNK]) for i in range(0, len(asked), _CHUNK)]
     for number in range(args.steps):
         rng = np.random.default_rng([args.seed, number])
-        batch = collator.in_parts([exercises.draw(rng) for _ in range(args.batch)])
+        batch = collator.in_parts([text_planning.draw(rng) for _ in range(args.batch)])
         for run in runs if number % 2 else reversed(runs):
             run.step(number, batch)
         if (number + 1) % 100 == 0 or number + 1 == args.steps:

@@ -14,7 +14,7 @@ from collections import Counter
 from pathlib import Path
 
 from configs.schema.collect import CollectConfig
-from proprio_mllm.evaluation.dagger import student_in_words
+from proprio_mllm.evaluation.dagger import student_in_text
 from proprio_mllm.report.statistics import wilson
 from sim.collection.text_planning import play_alone
 
@@ -26,9 +26,9 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    config = CollectConfig("exercises", "unused", args.episodes, seed=args.seed)
+    config = CollectConfig("text_planning", "unused", args.episodes, seed=args.seed)
     for model in args.models:
-        played = play_alone(config, student_in_words(str(model)))
+        played = play_alone(config, student_in_text(str(model)))
         categories = [str(episode.moments[0]["category"]) for episode in played]
         done = Counter(name for name, episode in zip(categories, played, strict=True) if episode.success)
         low, high = wilson(sum(done.values()), len(played))

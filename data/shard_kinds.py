@@ -1,7 +1,7 @@
 """Columns of each kind of shard; changing them means a new `data.shards.SCHEMA_VERSION`.
 
 Paper: none (engineering). `views`: posed views with truth for the point map and dense pretraining. `clips`: motion with
-captions and replayed views, stage 2. `demos`: expert steps. `exercises`: planning steps in words alone, `judgements`: was it
+captions and replayed views, stage 2. `demos`: expert steps. `text_planning`: steps in words alone, `goal_questions`: was it
 done. `rollouts`: SELU's trajectories, one row per episode, stage 3; images, motions and cameras have one entry per step and one
 for the end. `privileged` is for audits only: no loss or prompt may read it.
 """
@@ -90,8 +90,8 @@ KINDS: Final[Mapping[str, Mapping[str, Any]]] = {
         "target": _TEXT,
         "privileged": _TEXT,
     },
-    "exercises": _IN_WORDS,
-    "judgements": _IN_WORDS,
+    "text_planning": _IN_WORDS,
+    "goal_questions": _IN_WORDS,
     "rollouts": {
         "episode": _TEXT,
         "task": _TEXT,

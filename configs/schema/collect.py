@@ -13,7 +13,7 @@ class CollectConfig:
     """What is collected, how much, and where it goes.
 
     Attributes:
-        kind: `views` (posed views), `demos` (expert steps), `exercises` (planning steps in words alone) or `judgements` (was it
+        kind: `views` (posed views), `demos` (expert steps), `text_planning` (steps in words alone) or `goal_questions` (was it
             done, in words alone).
         out: shard folder.
         count: views, or episodes.
@@ -28,7 +28,7 @@ class CollectConfig:
         medium_share: demos: share of episodes at medium difficulty, so that recoveries appear.
     """
 
-    kind: Literal["views", "demos", "exercises", "judgements"]
+    kind: Literal["views", "demos", "text_planning", "goal_questions"]
     out: str
     count: int
     robots: tuple[str, ...] = ("h1", "x1")

@@ -13,7 +13,7 @@ __all__ = [
     "AlignmentConfig",
     "BaseConfig",
     "CollectStageConfig",
-    "CorrectionsConfig",
+    "DaggerConfig",
     "LoggerConfig",
     "LoopConfig",
     "SeluConfig",
@@ -24,7 +24,7 @@ __all__ = [
 
 #: Training tasks have 2^31 seeds, a million for each seed of a run.
 LARGEST_SEED = 2000
-StageName = Literal["all", "data", "collect", "base", "corrections", "pointmap", "tokenizer", "alignment", "selu"]
+StageName = Literal["all", "data", "collect", "base", "dagger", "pointmap", "tokenizer", "alignment", "selu"]
 Variant = Literal["full", "no_mpe", "no_cse", "no_mpe_cse", "no_proprio"]
 
 
@@ -80,7 +80,7 @@ class BaseConfig:
         joint: loop of the mixed batches.
         questions: question and answer pairs packed per image.
         plan_share: share of the joint batches that are planning demonstrations or exercises.
-        exercise_share: share of exercises in text alone among them.
+        text_share: share of exercises in text alone among them.
         judge_share: share of judging questions among the planning demonstrations.
         dense_weight: weight of the dense loss on the joint batches' views.
     """
@@ -89,12 +89,12 @@ class BaseConfig:
     joint: LoopConfig
     questions: int = 8
     plan_share: float = 0.7
-    exercise_share: float = 0.5
+    text_share: float = 0.5
     judge_share: float = 0.15
     dense_weight: float = 0.5
 
     def __post_init__(self) -> None:
-        _require_shares(self, "plan_share", "exercise_share", "judge_share")
+        _require_shares(self, "plan_share", "text_share", "judge_share")
         require(self.questions > 0, f"questions {self.questions} must be positive")
 
 
@@ -107,7 +107,7 @@ class AlignmentConfig:
         image: loop of phase 2a-ii, motion and image; the language model's LoRA frozen.
         joint: loop of phase 2b; rows, LoRA, CSE and merger train.
         plan_share: share of the joint batches that are planning demonstrations with proprioception, or exercises.
-        exercise_share: share of exercises without pictures among them.
+        text_share: share of exercises without pictures among them.
         judge_share: share of judging questions among the planning demonstrations, and among the exercises.
         questions: body-relative questions packed per image.
         mask: share of motion tokens hidden in masked motion.
@@ -117,13 +117,13 @@ class AlignmentConfig:
     image: LoopConfig
     joint: LoopConfig
     plan_share: float = 0.7
-    exercise_share: float = 0.3
+    text_share: float = 0.3
     judge_share: float = 0.15
     questions: int = 6
     mask: float = 0.3
 
     def __post_init__(self) -> None:
-        _require_shares(self, "plan_share", "exercise_share", "judge_share", "mask")
+        _require_shares(self, "plan_share", "text_share", "judge_share", "mask")
         require(self.questions > 0, f"questions {self.questions} must be positive")
 
 
@@ -165,35 +165,35 @@ class CollectStageConfig:
 
     Attributes:
         views: posed views.
-        exercises: episodes in words alone, for planning and for judging.
+        text_planning: episodes in words alone, for planning and for judging.
         episodes: expert episodes.
         workers: processes.
     """
 
     views: int = 6000
-    exercises: int = 2000
+    text_planning: int = 2000
     episodes: int = 500
     workers: int = 2
 
 
 @dataclass(frozen=True)
-class CorrectionsConfig:
-    """`stage=corrections`: the base model acts on training tasks, the expert names the right step in every state.
+class DaggerConfig:
+    """`stage=dagger`: the base model acts on training tasks, the expert names the right step in every state.
 
     Attributes:
         episodes: episodes in the simulator; those that do not end in success are dropped. 0 goes on without these.
-        exercises: episodes in words alone; 0 goes on without these.
+        text_planning: episodes in words alone; 0 goes on without these.
         expert_share: share of the steps that the expert takes itself, so that episodes get somewhere.
         workers: processes.
     """
 
     episodes: int = 0
-    exercises: int = 0
+    text_planning: int = 0
     expert_share: float = 0.25
     workers: int = 2
 
     def __post_init__(self) -> None:
-        for name in ("episodes", "exercises"):
+        for name in ("episodes", "text_planning"):
             require(getattr(self, name) >= 0, f"{name} {getattr(self, name)} must not be negative")
         require(self.workers > 0, f"workers {self.workers} must be positive")
         _require_shares(self, "expert_share")
@@ -229,7 +229,7 @@ class TrainConfig:
         resume: continue an interrupted stage from its checkpoint.
         data: where motions come from, and what is kept of them.
         collect: what the simulator writes before training.
-        corrections: what it writes with the base model at the controls.
+        dagger: what it writes with the base model at the controls.
     """
 
     stage: StageName
@@ -242,7 +242,7 @@ class TrainConfig:
     selu: SeluConfig
     data: DataConfig = field(default_factory=DataConfig)
     collect: CollectStageConfig = field(default_factory=CollectStageConfig)
-    corrections: CorrectionsConfig = field(default_factory=CorrectionsConfig)
+    dagger: DaggerConfig = field(default_factory=DaggerConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     output: str = "outputs"
     seed: int = 0

@@ -1,9 +1,9 @@
-"""Corrections (DAgger): a model acts on training tasks and the expert names the step it would have taken in each state.
+"""DAgger: a model acts on training tasks and the expert names the step it would have taken in each state.
 
 Demonstrations hardly show what follows a learned planner's own mistakes: placing with an empty hand, picking up what it holds,
 asking for an object it has not seen, going where it stands. The base model's mistakes, each with the expert's next step, join
 the demonstrations of stages 2 and 3, and those in words alone (`sim.collection.text_planning`), which cost a fiftieth, the
-exercises. This is the bridge that `train.py` wires: training asks with a `CorrectionRequest` and reads `demos` or `exercises`
+exercises. This is the bridge that `train.py` wires: training asks with a `DaggerRequest` and reads `demos` or `text_planning`
 shards.
 
 Part files are a function of the request and their number, so a run can be killed and continued. The paper has no such data; its
@@ -28,18 +28,18 @@ from data.interface.observation import Observation
 from data.interface.steps import PlanStep
 from data.shards import ShardWriter
 from data.workers import start_worker
-from proprio_mllm.training.rollouts import CorrectionRequest
+from proprio_mllm.training.rollouts import DaggerRequest
 
 if TYPE_CHECKING:
     from proprio_mllm.planners.mllm import MllmPlanner
 
-__all__ = ["collect_corrections", "student_in_words"]
+__all__ = ["collect_dagger", "student_in_text"]
 
 #: Episodes of a part; those in words go side by side.
-_PER_PART: Final[dict[str, int]] = {"demos": 10, "exercises": 50}
+_PER_PART: Final[dict[str, int]] = {"demos": 10, "text_planning": 50}
 
 
-def collect_corrections(request: CorrectionRequest, robots: Sequence[str] = ("h1", "x1"), workers: int = 2) -> None:
+def collect_dagger(request: DaggerRequest, robots: Sequence[str] = ("h1", "x1"), workers: int = 2) -> None:
     """Lets the model act and writes a complete shard folder; an interrupted one is continued part by part.
 
     Args:
@@ -55,7 +55,7 @@ def collect_corrections(request: CorrectionRequest, robots: Sequence[str] = ("h1
     )  # fmt: skip
     count = -(-request.episodes // size)
     missing = writer.missing(count)
-    with tqdm(total=count, initial=count - len(missing), desc=f"corrections ({request.kind})", unit="part") as bar:
+    with tqdm(total=count, initial=count - len(missing), desc=f"dagger ({request.kind})", unit="part") as bar:
         for part, rows in _computed(config, missing, str(request.model), workers):
             writer.write(part, rows)
             bar.update(1)
@@ -94,14 +94,14 @@ def _one_thread() -> Iterator[None]:
 
 def _part(config: CollectConfig, part: int, model: str) -> list[dict[str, Any]]:
     """One part; imports simulator and model only here, so that workers start light."""
-    if config.kind == "exercises":
-        from sim.collection.text_planning import corrections_of_part as in_words
+    if config.kind == "text_planning":
+        from sim.collection.text_planning import dagger_of_part as in_words
 
-        return list(in_words(config, part, student_in_words(model)))
+        return list(in_words(config, part, student_in_text(model)))
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from sim.collection.demonstrations import corrections_of_part
+    from sim.collection.demonstrations import dagger_of_part
 
-    return list(corrections_of_part(config, part, _student(model)))
+    return list(dagger_of_part(config, part, _student(model)))
 
 
 @functools.cache
@@ -119,7 +119,7 @@ def _student(model: str) -> Callable[[Observation], PlanStep | None]:
     return lambda observation: _planner(model).step(observation, None).step
 
 
-def student_in_words(model: str) -> Callable[[Sequence[Mapping[str, Any]]], list[PlanStep | None]]:
+def student_in_text(model: str) -> Callable[[Sequence[Mapping[str, Any]]], list[PlanStep | None]]:
     """The model in a folder as a student of `sim.collection.text_planning`: greedy steps for moments in words."""
     from proprio_mllm.model.batch import Example
     from proprio_mllm.planners.protocol import parse_reply

@@ -20,9 +20,9 @@ from proprio_mllm.model.vocabulary import motion_text
 __all__ = [
     "Style",
     "answers",
+    "body_state_prompt",
     "critic_prompt",
     "described_motion",
-    "felt_body",
     "filled_motion",
     "looking",
     "made_motion",
@@ -174,7 +174,7 @@ def described_motion(
     return with_answer((_system("move", style), Message("user", f"{ask}{shown}", images=int(image))), caption)
 
 
-def felt_body(motion: Sequence[int] | str, hands: str, height: str, style: Style = "terse") -> tuple[Message, ...]:
+def body_state_prompt(motion: Sequence[int] | str, hands: str, height: str, style: Style = "terse") -> tuple[Message, ...]:
     """Motion to the body's state at its end: which hands are open, and how high the pelvis is.
 
     Args:

@@ -11,7 +11,7 @@ other's pairs train. Besides clip captions, motion and image to text holds quest
 (which arm reaches an object, how far the body must go down), and motion to text asks which hands are open and how high the
 pelvis is, which captions do not say and planning needs. A share of planning demonstrations, with motion tokens in the prompt,
 keeps the planner's format, and exercises in words, now with motion that agrees with their log, keep what the base stage
-learnt from them; the paper does not mention any such replay. Corrections (`stage=corrections`) count as demonstrations and as
+learnt from them; the paper does not mention any such replay. Corrections (`stage=dagger`) count as demonstrations and as
 exercises here.
 
 The control `variant=no_proprio` has the joint phase alone, and of its pairs those that need no motion.
@@ -33,15 +33,15 @@ from data.motion import HAND_OPENING, OPEN_HAND, PELVIS_HEIGHT
 from proprio_mllm.model.batch import Batch, Collator, Example
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.prompts import Style, described_motion, felt_body, filled_motion, looking, made_motion
+from proprio_mllm.model.prompts import Style, body_state_prompt, described_motion, filled_motion, looking, made_motion
 from proprio_mllm.training.asking import answer_shares
 from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.phrases import body_state_words
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, Exercises, Judgements, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, GoalQuestions, TextPlanning, Views
 
 __all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Phase", "body_state", "body_state_accuracy"]
 
-Kind = Literal["say", "feel", "do", "fill", "say_image", "body", "plan", "exercise"]
+Kind = Literal["say", "feel", "do", "fill", "say_image", "body", "plan", "text"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +71,12 @@ class AlignmentData:
         clips: Clips,
         views: Views,
         demos: Demos,
-        exercises: Exercises,
-        judgements: Judgements,
+        text_planning: TextPlanning,
+        goal_questions: GoalQuestions,
         cfg: AlignmentConfig,
     ) -> None:
         self.tokenizer, self.clips, self.views, self.demos = tokenizer, clips, views, demos
-        self.exercises, self.judgements = exercises, judgements
+        self.text_planning, self.goal_questions = text_planning, goal_questions
         self._cfg, self._collator = cfg, Collator(model.processor, model.cfg)
         self._style: Style = model.cfg.prompt
         self._proprioception = model.cfg.proprioception
@@ -95,9 +95,9 @@ class AlignmentData:
         return self._collator.in_parts(self._examples(kind, rng, size))
 
     def _examples(self, kind: Kind, rng: np.random.Generator, size: int) -> list[Example]:
-        if kind == "exercise":
+        if kind == "text":
             judged = rng.random(size) < self._cfg.judge_share
-            return [self.judgements.draw(rng) if one else self.exercises.draw(rng, self.bodies) for one in judged]
+            return [self.goal_questions.draw(rng) if one else self.text_planning.draw(rng, self.bodies) for one in judged]
         if kind == "plan":
             return [self._plan(int(i), rng) for i in self.demos.draw(rng, size)]
         if kind == "body":
@@ -130,7 +130,7 @@ class AlignmentData:
         assert self.bodies is not None
         grips = self.bodies.grips
         rows = [int(rng.choice(grips[group])) for group in rng.integers(len(grips), size=size)]
-        return [Example(felt_body(self.bodies.row(i), *body_state(self.demos.motions[i]), self._style)) for i in rows]
+        return [Example(body_state_prompt(self.bodies.row(i), *body_state(self.demos.motions[i]), self._style)) for i in rows]
 
     def _say_image(self, clip: int, rng: np.random.Generator) -> Example:
         view, motion = self.clips.view(clip, rng)
@@ -164,7 +164,7 @@ def body_state_accuracy(model: ProprioMLLM, demos: Demos, tokens: MotionTokenize
     result: dict[str, float] = {}
     for part, name in enumerate(("hands", "pelvis")):
         asked = [
-            Example(felt_body(codes[i].tolist(), hands if part else "", "", model.cfg.prompt))
+            Example(body_state_prompt(codes[i].tolist(), hands if part else "", "", model.cfg.prompt))
             for i, (hands, _) in zip(rows, truth, strict=True)
         ]
         result |= answer_shares(model, name, asked, [state[part] for state in truth])
@@ -188,7 +188,7 @@ class AlignmentObjective:
         """A batch of one kind, drawn anew each step."""
         others: tuple[Kind, ...] = tuple(kind for kind in self._kinds if kind != "plan")
         if "plan" in self._kinds and rng.random() < self._cfg.plan_share:
-            kind: Kind = "exercise" if rng.random() < self._cfg.exercise_share else "plan"
+            kind: Kind = "text" if rng.random() < self._cfg.text_share else "plan"
         else:
             kind = others[int(rng.integers(len(others)))]
         return kind, self._data.batch(kind, rng, size)

@@ -25,9 +25,9 @@ from proprio_mllm.model.prompts import looking
 from proprio_mllm.training.asking import LONGEST_STEP, answer_shares, replies
 from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.phrases import phrase
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, Exercises, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, TextPlanning, Views
 
-__all__ = ["DenseObjective", "JointObjective", "exercise_accuracy", "grounding_accuracy", "plan_accuracy"]
+__all__ = ["DenseObjective", "JointObjective", "grounding_accuracy", "plan_accuracy", "text_accuracy"]
 
 #: Share of phrases among the exercises.
 PHRASES: Final = 0.1
@@ -64,7 +64,7 @@ class _WithDense(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class _JointBatch(Movable):
-    kind: Literal["dense", "look", "plan", "exercise"]
+    kind: Literal["dense", "look", "plan", "text"]
     text: Batch | tuple[Batch, ...] | None
     images: ImageBatch | None
     dense: DenseTargets | None
@@ -126,20 +126,20 @@ class JointObjective(_Base):
         head: DenseHead,
         views: Views,
         demos: Demos,
-        exercises: Exercises,
+        text_planning: TextPlanning,
         clips: Clips,
         cfg: BaseConfig,
         key: str,
     ) -> None:
         super().__init__(model, head, views, cfg, key)
-        self._demos, self._exercises, self._clips = demos, exercises, clips
+        self._demos, self._text_planning, self._clips = demos, text_planning, clips
 
     def batch(self, rng: np.random.Generator, size: int) -> _JointBatch:
         """A batch of views or of planning steps."""
         if rng.random() >= self._cfg.plan_share:
             return self._view_batch(rng, size, self._cfg.questions)
-        if rng.random() < self._cfg.exercise_share:
-            return _JointBatch("exercise", self._collator.in_parts([self._words(rng) for _ in range(size)]), None, None, 0.0)
+        if rng.random() < self._cfg.text_share:
+            return _JointBatch("text", self._collator.in_parts([self._words(rng) for _ in range(size)]), None, None, 0.0)
         examples = [
             judge_example(self._demos, i, rng, None) if rng.random() < self._cfg.judge_share else self._demos.example(i, None)
             for i in self._demos.draw(rng, size)
@@ -149,7 +149,7 @@ class JointObjective(_Base):
     def _words(self, rng: np.random.Generator) -> Example:
         if rng.random() < PHRASES:
             return phrase(self._clips, rng, self._demos.style)
-        return self._exercises.draw(rng)
+        return self._text_planning.draw(rng)
 
 
 @torch.no_grad()
@@ -189,15 +189,15 @@ def grounding_accuracy(
 
 
 @torch.no_grad()
-def exercise_accuracy(
-    model: ProprioMLLM, exercises: Exercises, bodies: Bodies | None = None, limit: int = 200
+def text_accuracy(
+    model: ProprioMLLM, text_planning: TextPlanning, bodies: Bodies | None = None, limit: int = 200
 ) -> dict[str, float]:
     """Share of held-out exercises without pictures that the model's greedy reply repeats exactly; `bodies` adds motion."""
     rng = np.random.default_rng(0)
-    order = [int(i) for i in exercises.test[:: max(1, len(exercises.test) // limit)][:limit]]
-    said = replies(model, [exercises.example(i, rng, bodies, answered=False) for i in order], LONGEST_STEP)
-    exact = sum(reply == exercises.target(i) for i, reply in zip(order, said, strict=True))
-    return {"exercise_exact": exact / max(len(order), 1), "exercise_steps": float(len(order))}
+    order = [int(i) for i in text_planning.test[:: max(1, len(text_planning.test) // limit)][:limit]]
+    said = replies(model, [text_planning.example(i, rng, bodies, answered=False) for i in order], LONGEST_STEP)
+    exact = sum(reply == text_planning.target(i) for i, reply in zip(order, said, strict=True))
+    return {"text_exact": exact / max(len(order), 1), "text_steps": float(len(order))}
 
 
 @torch.no_grad()

@@ -1,7 +1,7 @@
 """Where stages keep their outputs, and when an output is current.
 
-    <output>/<model>/data/{clips,views,exercises,demos,corrections,…}   shards, shared by all variants
-    <output>/<model>/shared/{base,corrections,pointmap,tokenizer}
+    <output>/<model>/data/{clips,views,text_planning,demos,dagger,…}   shards, shared by all variants
+    <output>/<model>/shared/{base,dagger,pointmap,tokenizer}
     <output>/<model>/<variant>/{alignment,selu}
 
 A finished stage writes `done.json` with its key (hash of configuration and inputs) and its metrics; the stage is current while
@@ -22,7 +22,7 @@ from data.shards import config_hash
 
 __all__ = ["StagePaths", "finish", "finished_key", "stage_key"]
 
-_SHARED = ("base", "corrections", "pointmap", "tokenizer")
+_SHARED = ("base", "dagger", "pointmap", "tokenizer")
 
 
 class StagePaths:
@@ -33,7 +33,7 @@ class StagePaths:
         self.variant = cfg.variant
 
     def shards(self, kind: str) -> Path:
-        """Folder of shards: `clips`, `views`, `exercises`, `judgements`, `demos`, `corrections` or `corrections_in_words`."""
+        """Folder of shards: `clips`, `views`, `text_planning`, `goal_questions`, `demos`, `dagger` or `dagger_in_text`."""
         return self.root / "data" / kind
 
     def stage(self, name: str) -> Path:

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from proprio_mllm.model.batch import Example
-from proprio_mllm.model.prompts import Style, described_motion, felt_body
+from proprio_mllm.model.prompts import Style, body_state_prompt, described_motion
 from proprio_mllm.training.sources import Clips
 
 __all__ = ["body_state_words", "phrase"]
@@ -35,4 +35,4 @@ def phrase(clips: Clips, rng: np.random.Generator, style: Style) -> Example:
     left, right = (bool(rng.random() < 0.5) for _ in range(2))
     hands, height = body_state_words(left, right, float(rng.uniform(_LOWEST_M, _HIGHEST_M)))
     told = f"left {'open' if left else 'closed'} right {'open' if right else 'closed'} height {height}"
-    return Example(felt_body(told, hands, height, style))
+    return Example(body_state_prompt(told, hands, height, style))

@@ -107,7 +107,7 @@ class Pipeline:
         collect_rollouts: runs an actor in the simulator and writes `rollouts` shards; given by the entry point, because
             training does not know the simulator.
         command: the command line, stored with every finished stage.
-        collect_corrections: lets a model act in the simulator and writes the teacher's corrections; given likewise.
+        collect_dagger: lets a model act in the simulator and writes the teacher's corrections; given likewise.
     """
 
     def __init__(
@@ -116,11 +116,11 @@ class Pipeline:
         cfg: TrainConfig,
         collect_rollouts: Callable[..., Any] | None = None,
         command: str = "",
-        collect_corrections: Callable[..., Any] | None = None,
+        collect_dagger: Callable[..., Any] | None = None,
     ) -> None:
         self.stages, self.cfg, self.command = stages, cfg, command
         self.paths = StagePaths(cfg)
-        self.collect_rollouts, self.collect_corrections = collect_rollouts, collect_corrections
+        self.collect_rollouts, self.collect_dagger = collect_rollouts, collect_dagger
         self._taken: Metrics = {}  # steps of each run of the current stage: a time budget may end it early
 
     def key(self, name: str) -> str:

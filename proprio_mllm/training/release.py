@@ -105,7 +105,7 @@ def _shrink(folder: Path) -> None:
 
 def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
     shards = {}
-    for kind in ("clips", "views", "exercises", "judgements", "demos", "corrections", "corrections_in_words"):
+    for kind in ("clips", "views", "text_planning", "goal_questions", "demos", "dagger", "dagger_in_text"):
         folder = pipeline.paths.shards(kind)
         if (folder / "manifest.json").is_file():
             shards[kind] = shard_hash(folder)

@@ -25,7 +25,7 @@ from data.motion import KEY_BODY_COUNT
 from data.shards import ShardReader, decode_motion, decode_png, encode_png
 from proprio_mllm.model.batch import View
 
-__all__ = ["CorrectionRequest", "Moment", "Rollout", "RolloutCollector", "RolloutRequest", "read_rollouts", "rollout_row"]
+__all__ = ["DaggerRequest", "Moment", "Rollout", "RolloutCollector", "RolloutRequest", "read_rollouts", "rollout_row"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +50,13 @@ class RolloutRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class CorrectionRequest:
+class DaggerRequest:
     """What is asked of whoever lets a model act and has the expert correct it.
 
     Attributes:
         model: folder of the model that acts.
         folder: shard folder to write.
-        kind: `demos` in the simulator, where episodes that do not end in success are dropped, or `exercises` in words alone.
+        kind: `demos` in the simulator, which drops episodes without success, or `text_planning` in words alone.
         episodes: number of episodes.
         seed: of tasks and draws.
         expert_share: share of the steps that the expert takes itself.
@@ -66,7 +66,7 @@ class CorrectionRequest:
 
     model: Path
     folder: Path
-    kind: Literal["demos", "exercises"]
+    kind: Literal["demos", "text_planning"]
     episodes: int
     seed: int
     expert_share: float

@@ -34,7 +34,7 @@ from proprio_mllm.model.questions import arm_answer, ask, distance_answer, heigh
 from proprio_mllm.training.states import asked_relation, history_of, open_hands, states_from_log
 from proprio_mllm.training.text_planning import OBJECT_ID, Exchange, is_symbolic
 
-__all__ = ["Bodies", "Clips", "Demos", "Exercises", "Judgements", "Views", "held_out", "shard_hash", "step_in_words"]
+__all__ = ["Bodies", "Clips", "Demos", "GoalQuestions", "TextPlanning", "Views", "held_out", "shard_hash", "step_in_words"]
 
 #: One in this many views, episodes and clips is never trained on.
 HELD_OUT = 20
@@ -293,8 +293,8 @@ class Demos:
         prompt = _planning(row, motion, self._cfg, self._logs.right(index) if answered else ())
         return Example(with_answer(prompt, row["target"]) if answered else prompt, (self.view(row),))
 
-    def exercise(self, rng: np.random.Generator, bodies: Bodies | None = None) -> Example:
-        """A step without its picture, names exchanged (see `exercises`); with `bodies` its motion stays."""
+    def text_step(self, rng: np.random.Generator, bodies: Bodies | None = None) -> Example:
+        """A step without its picture, names exchanged (see `text_planning`); with `bodies` its motion stays."""
         index = int(rng.choice(self._symbolic))
         exchanged = Exchange.draw(rng).row(self.reader[index])
         motion = None if bodies is None else bodies.row(index)
@@ -346,21 +346,21 @@ class Bodies:
         return None if rows is None else self.row(int(rng.choice(rows)))
 
 
-class Exercises:
+class TextPlanning:
     """Text-planning rows of shards (`sim.collection.text_planning` writes them), and logs with names exchanged.
 
     Args:
-        folder: `exercises` shards.
+        folder: `text_planning` shards.
         cfg: the model's.
         demos: the logs.
         corrected: shards of the same kind, corrections in words; None leaves them out.
     """
 
     def __init__(self, folder: Path, cfg: ModelConfig, demos: Demos, corrected: Path | None = None) -> None:
-        self.reader = ShardReader(folder, "exercises")
+        self.reader = ShardReader(folder, "text_planning")
         self._cfg, self._demos, self._logs = cfg, demos, _Logs([self.reader])
-        corrections = None if corrected is None else ShardReader(corrected, "exercises")
-        self._corrected = None if corrections is None else (corrections, _Logs([corrections]))
+        dagger = None if corrected is None else ShardReader(corrected, "text_planning")
+        self._corrected = None if dagger is None else (dagger, _Logs([dagger]))
         # rows of an episode stand together: the last ones are held out
         self._train = len(self.reader) - len(self.reader) // HELD_OUT
         self.test = np.arange(self._train, len(self.reader), dtype=np.int64)
@@ -373,7 +373,7 @@ class Exercises:
             return self._step(reader[index], rng, bodies, logs.right(index))
         kind = rng.random()
         if kind < FROM_LOGS:
-            return self._demos.exercise(rng, bodies)
+            return self._demos.text_step(rng, bodies)
         index = int(rng.integers(self._train))
         if kind < FROM_LOGS + NAMING:
             return self._naming(index)
@@ -410,11 +410,11 @@ class Exercises:
         return str(self.reader[int(index)]["target"])
 
 
-class Judgements:
+class GoalQuestions:
     """Questions in text alone whether an instruction was carried out (`sim.collection.text_planning`)."""
 
     def __init__(self, folder: Path, cfg: ModelConfig) -> None:
-        self.reader = ShardReader(folder, "judgements")
+        self.reader = ShardReader(folder, "goal_questions")
         self._cfg = cfg
 
     def draw(self, rng: np.random.Generator) -> Example:

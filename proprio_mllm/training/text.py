@@ -15,13 +15,13 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import critic_prompt, looking, self_ask_prompt
 from proprio_mllm.training.goals import type_words
 from proprio_mllm.training.phrases import phrase
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, TextPlanning, Views
 
 __all__ = ["corpus", "start_from_words", "whole_words"]
 
 
 def corpus(
-    cfg: ModelConfig, views: Views, demos: Demos, exercises: Exercises, clips: Clips, seed: int = 0, limit: int = 4000
+    cfg: ModelConfig, views: Views, demos: Demos, text_planning: TextPlanning, clips: Clips, seed: int = 0, limit: int = 4000
 ) -> list[str]:
     """Texts of every kind that the model will read or write.
 
@@ -29,7 +29,7 @@ def corpus(
         cfg: prompt style.
         views: shards.
         demos: shards.
-        exercises: shards.
+        text_planning: shards.
         clips: shards.
         seed: of the choice of rows.
         limit: rows per kind.
@@ -39,7 +39,7 @@ def corpus(
     for index in _some(demos.split.train, limit, rng):
         example = demos.example(int(index), None)
         texts.append(render(example.messages))
-    texts.extend(render(exercises.draw(rng).messages) for _ in range(limit))
+    texts.extend(render(text_planning.draw(rng).messages) for _ in range(limit))
     texts.extend(render(phrase(clips, rng, cfg.prompt).messages) for _ in range(limit // 4))
     for index in _some(views.split.train, limit // 4, rng):
         row = views.row(int(index))

@@ -32,14 +32,14 @@ __all__ = ["collect", "main", "parts_of", "rows_of_part"]
 _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.
-_VERSION = {"views": 2, "demos": 3, "exercises": 3, "judgements": 3}
+_VERSION = {"views": 2, "demos": 3, "text_planning": 3, "goal_questions": 3}
 _IN_WORDS = ("out", "workers", "views_per_world", "image_size", "noise", "medium_share")
 #: Fields that do not change what is written.
 _UNKEYED = {
     "views": ("out", "workers", "noise", "medium_share"),
     "demos": ("out", "workers", "views_per_world"),
-    "exercises": _IN_WORDS,
-    "judgements": _IN_WORDS,
+    "text_planning": _IN_WORDS,
+    "goal_questions": _IN_WORDS,
 }
 
 
@@ -54,14 +54,14 @@ def rows_of_part(config: CollectConfig, part: int) -> list[dict[str, Any]]:
         from sim.collection.view_sampling import views_of_part
 
         return list(views_of_part(config, part))
-    if config.kind == "exercises":
-        from sim.collection.text_planning import exercises_of_part
+    if config.kind == "text_planning":
+        from sim.collection.text_planning import text_planning_of_part
 
-        return list(exercises_of_part(config, part))
-    if config.kind == "judgements":
-        from sim.collection.text_planning import judgements_of_part
+        return list(text_planning_of_part(config, part))
+    if config.kind == "goal_questions":
+        from sim.collection.text_planning import goal_questions_of_part
 
-        return list(judgements_of_part(config, part))
+        return list(goal_questions_of_part(config, part))
     from sim.collection.demonstrations import demos_of_part
 
     return list(demos_of_part(config, part))

@@ -33,10 +33,10 @@ __all__ = [
     "Episode",
     "Student",
     "accepted",
-    "corrections_of_part",
+    "dagger_of_part",
     "demos_of_part",
     "perturbed",
-    "run_correction",
+    "run_dagger_episode",
     "run_episode",
 ]
 
@@ -103,9 +103,9 @@ def run_episode(config: CollectConfig, index: int, sessions: dict[tuple[str, str
     return episode
 
 
-def corrections_of_part(config: CollectConfig, part: int, student: Student) -> Iterator[dict[str, Any]]:
+def dagger_of_part(config: CollectConfig, part: int, student: Student) -> Iterator[dict[str, Any]]:
     """Rows of one part of a `demos` folder whose steps the student chose and the expert corrected."""
-    yield from _rows_of_part(config, part, lambda cfg, index, sessions: run_correction(cfg, index, sessions, student))
+    yield from _rows_of_part(config, part, lambda cfg, index, sessions: run_dagger_episode(cfg, index, sessions, student))
 
 
 def accepted(proposed: PlanStep | None, last: HistoryItem | None) -> PlanStep | None:
@@ -134,7 +134,7 @@ def _rows_of_part(config: CollectConfig, part: int, play: Play) -> Iterator[dict
             session.close()
 
 
-def run_correction(
+def run_dagger_episode(
     config: CollectConfig, index: int, sessions: dict[tuple[str, str], Session] | None, student: Student
 ) -> Episode:
     """Plays one episode in which a student acts and the expert names the step it would have taken.

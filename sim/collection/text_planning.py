@@ -7,9 +7,9 @@ planner names the next one, and part of the steps that are taken are mistakes, s
 it. Steps that only eyes could justify (a turn towards something unseen, a change of height that nothing has called for yet) are
 taken, not recorded.
 
-Rows of `exercises` shards, and of `judgements` shards, which ask whether an instruction has been carried out at a moment of
-such an episode. For training without pictures; no result is ever measured here. The paper starts from a pretrained language
-model instead.
+Rows of `text_planning` shards, and of `goal_questions` shards, which ask whether an instruction has been carried out at a
+moment of such an episode. For training without pictures; no result is ever measured here. The paper starts from a pretrained
+language model instead.
 """
 
 from __future__ import annotations
@@ -31,7 +31,15 @@ from sim.tasks.drafts import Draft, NoDraft, Scene
 from sim.tasks.families import CATEGORIES, FAMILIES, draw, family_of
 from sim.tasks.sample import UNSEEN_TYPES, rng_for, scene_of
 
-__all__ = ["Exercise", "corrections_of_part", "exercises_of_part", "judgement", "judgements_of_part", "play", "play_alone"]
+__all__ = [
+    "TextEpisode",
+    "dagger_of_part",
+    "goal_question",
+    "goal_questions_of_part",
+    "play",
+    "play_alone",
+    "text_planning_of_part",
+]
 
 #: Earlier steps that a row keeps, and steps after which an episode ends.
 _HISTORY: Final = 8
@@ -44,12 +52,12 @@ _ROOMY: Final = ("CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk"
 _CONTAINERS: Final = ("Fridge", "Cabinet", "Drawer", "Microwave")
 _SWITCHES: Final = ("Faucet", "StoveKnob", "Microwave", "FloorLamp", "Television", "LightSwitch")
 _EXTRAS: Final = ("Sofa", "GarbageCan", "Chair", "TVStand", "Toilet")
-#: What a learned planner does at each of several moments (rows of `exercises` without the target); None where it names no step.
+#: What a learned planner does at each of several moments (rows without their target); None where it names no step.
 Student = Callable[[Sequence[Mapping[str, Any]]], Sequence[PlanStep | None]]
 
 
 @dataclass(slots=True)
-class Exercise:
+class TextEpisode:
     """One episode.
 
     Attributes:
@@ -67,27 +75,27 @@ class Exercise:
     codes: set[str] = field(default_factory=set)
 
 
-def exercises_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
-    """Rows of one part of an `exercises` folder; the same for the same configuration, whoever computes it."""
+def text_planning_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
+    """Rows of one part of an `text_planning` folder; the same for the same configuration, whoever computes it."""
     for index in config.indices(part):
         yield from play(config, index).rows
 
 
-def play(config: CollectConfig, index: int) -> Exercise:
+def play(config: CollectConfig, index: int) -> TextEpisode:
     """Plays one episode with the expert's steps and drawn mistakes.
 
     Args:
         config: the collection.
         index: number of the episode; names every draw.
     """
-    episode = _Episode(config, index, "exercises")
+    episode = _Episode(config, index, "text_planning")
     while (target := episode.ask()) is not None:
         episode.take(episode.world.mistake(target) if episode.rng.random() < episode.mistakes else target)
     return episode.close()
 
 
-def corrections_of_part(config: CollectConfig, part: int, student: Student) -> Iterator[dict[str, Any]]:
-    """Rows of one part of an `exercises` folder whose steps a student chose and the expert corrected.
+def dagger_of_part(config: CollectConfig, part: int, student: Student) -> Iterator[dict[str, Any]]:
+    """Rows of one part of an `text_planning` folder whose steps a student chose and the expert corrected.
 
     Args:
         config: the collection; `noise` is the share of steps that the expert takes itself, besides those in which the student
@@ -100,17 +108,17 @@ def corrections_of_part(config: CollectConfig, part: int, student: Student) -> I
         own = episode.rng.random() >= config.noise
         return (accepted(proposed, episode.last) if own else None) or target
 
-    episodes = [_Episode(config, index, "corrected exercises") for index in config.indices(part)]
+    episodes = [_Episode(config, index, "dagger in text") for index in config.indices(part)]
     for episode in _side_by_side(episodes, student, chosen):
         yield from episode.rows
 
 
-def play_alone(config: CollectConfig, student: Student) -> list[Exercise]:
+def play_alone(config: CollectConfig, student: Student) -> list[TextEpisode]:
     """Plays every episode of a collection side by side with a student that nobody helps; a reply without a step does nothing.
 
     Measures what a planner makes of words alone, apart from the benchmark's tasks: for choosing between training recipes.
     """
-    episodes = [_Episode(config, index, "held-out exercises") for index in range(config.count)]
+    episodes = [_Episode(config, index, "held-out text planning") for index in range(config.count)]
     return _side_by_side(episodes, student, lambda episode, target, proposed: proposed)
 
 
@@ -118,11 +126,11 @@ def _side_by_side(
     episodes: Sequence[_Episode],
     student: Student,
     choose: Callable[[_Episode, PlanStep, PlanStep | None], PlanStep | None],
-) -> list[Exercise]:
+) -> list[TextEpisode]:
     """Plays episodes to their ends, the student answering for all that still run at once."""
     running = list(episodes)
     while asked := [(episode, target) for episode in running if (target := episode.ask()) is not None]:
-        proposals = student([episode.exercise.moments[-1] for episode, _ in asked])
+        proposals = student([episode.record.moments[-1] for episode, _ in asked])
         for (episode, target), proposed in zip(asked, proposals, strict=True):
             episode.take(choose(episode, target, proposed))
         running = [episode for episode, _ in asked]
@@ -136,7 +144,7 @@ class _Episode:
         rng: every draw of the episode, the world's too.
         world: the facts.
         mistakes: share of steps that are mistakes.
-        exercise: what has been recorded.
+        record: what has been recorded.
     """
 
     def __init__(self, config: CollectConfig, index: int, name: str) -> None:
@@ -149,7 +157,7 @@ class _Episode:
         self._budget = int(np.ceil(1.5 * family_of(draft.family).steps)) + 2 + int(self.rng.choice((0, 0, 5, 10)))
         self._steps = min(self._budget, _MAX_STEPS)
         self.mistakes = float(self.rng.choice(_MISTAKES))
-        self.exercise = Exercise(draft.family)
+        self.record = TextEpisode(draft.family)
         self._history: list[dict[str, str]] = []
         self._task = {
             "instruction": instruction,
@@ -162,7 +170,7 @@ class _Episode:
     def ask(self) -> PlanStep | None:
         """Records the moment; the expert's step there, None when the episode is over."""
         number = len(self._history)
-        self.exercise.moments.append(
+        self.record.moments.append(
             {
                 **self._task,
                 "step": number,
@@ -176,7 +184,7 @@ class _Episode:
             return None
         target, justified = answer
         if justified:
-            self.exercise.rows.append({**self.exercise.moments[-1], "target": target.to_text()})
+            self.record.rows.append({**self.record.moments[-1], "target": target.to_text()})
         return target
 
     @property
@@ -190,32 +198,32 @@ class _Episode:
             self._history.append({"step": "", "feedback": INVALID_OUTPUT})
             return
         outcomes = self.world.take(step)
-        self.exercise.codes |= {str(code) for _, code in outcomes}
+        self.record.codes |= {str(code) for _, code in outcomes}
         feedback = "; ".join(f"{action.to_text()} {code}" for action, code in outcomes)
         self._history.append({"step": step.to_text(), "feedback": feedback})
 
-    def close(self) -> Exercise:
+    def close(self) -> TextEpisode:
         """The record, with whether the goals hold."""
-        self.exercise.success = self.world.answer() is None
-        return self.exercise
+        self.record.success = self.world.answer() is None
+        return self.record
 
 
-def judgements_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
-    """Rows of one part of a `judgements` folder: one question of each episode."""
+def goal_questions_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
+    """Rows of one part of a `goal_questions` folder: one question of each episode."""
     for index in config.indices(part):
-        yield judgement(config, index)
+        yield goal_question(config, index)
 
 
-def judgement(config: CollectConfig, index: int) -> dict[str, Any]:
+def goal_question(config: CollectConfig, index: int) -> dict[str, Any]:
     """Whether the instruction has been carried out: half of the answers are yes.
 
     A no is about the moment before the last step, an earlier one, the end of an episode that failed, or the end of one that did
     something else.
     """
-    rng = rng_for("judgements", config.seed, index)
-    exercise = play(config, index)
-    end = exercise.moments[-1]
-    if not exercise.success:
+    rng = rng_for("goal_questions", config.seed, index)
+    episode = play(config, index)
+    end = episode.moments[-1]
+    if not episode.success:
         return {**end, "target": "no"}
     if rng.random() < 0.5:
         return {**end, "target": "yes"}
@@ -224,7 +232,7 @@ def judgement(config: CollectConfig, index: int) -> dict[str, Any]:
         instruction = other.sentences(scene.furniture, rng)[0]
         target = "no" if instruction != end["instruction"] else "yes"
         return {**end, "instruction": instruction, "named": list(other.focus.values()), "target": target}
-    earlier = exercise.moments[:-1]
+    earlier = episode.moments[:-1]
     if not earlier:
         return {**end, "target": "yes"}
     before = earlier[-1] if rng.random() < 0.5 else earlier[int(rng.integers(len(earlier)))]

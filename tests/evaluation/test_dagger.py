@@ -16,25 +16,25 @@ from data.interface.observation import Observation
 from data.interface.steps import PlanStep
 from data.shards import ShardReader
 from proprio_mllm.evaluation import dagger
-from proprio_mllm.evaluation.dagger import collect_corrections
-from proprio_mllm.training.rollouts import CorrectionRequest
+from proprio_mllm.evaluation.dagger import collect_dagger
+from proprio_mllm.training.rollouts import DaggerRequest
 
 
 @pytest.fixture
-def request_(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CorrectionRequest:
+def request_(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DaggerRequest:
     def student(observation: Observation) -> PlanStep | None:
         return PlanStep.parse(f"GoTo({observation.known_objects[-1]})")
 
     monkeypatch.setattr(dagger, "_student", lambda model: student)
-    monkeypatch.setattr(dagger, "_PER_PART", {"demos": 2, "exercises": 2})
-    return CorrectionRequest(tmp_path / "model", tmp_path / "corrections", "demos", 4, 0, 0.5, 56, "hash")
+    monkeypatch.setattr(dagger, "_PER_PART", {"demos": 2, "text_planning": 2})
+    return DaggerRequest(tmp_path / "model", tmp_path / "dagger", "demos", 4, 0, 0.5, 56, "hash")
 
 
 def test_an_interrupted_run_continues_to_the_same_rows(
-    request_: CorrectionRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    request_: DaggerRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = CorrectionRequest(request_.model, tmp_path / "whole", "demos", 4, 0, 0.5, 56, "hash")
-    collect_corrections(whole, workers=1)
+    whole = DaggerRequest(request_.model, tmp_path / "whole", "demos", 4, 0, 0.5, 56, "hash")
+    collect_dagger(whole, workers=1)
     part, calls = dagger._part, []
 
     def dies(config, number, model):
@@ -45,10 +45,10 @@ def test_an_interrupted_run_continues_to_the_same_rows(
 
     monkeypatch.setattr(dagger, "_part", dies)
     with pytest.raises(KeyboardInterrupt):
-        collect_corrections(request_, workers=1)
-    collect_corrections(request_, workers=1)
+        collect_dagger(request_, workers=1)
+    collect_dagger(request_, workers=1)
     assert calls == [0, 1, 1]
-    collect_corrections(request_, workers=1)
+    collect_dagger(request_, workers=1)
     assert len(calls) == 3
     one, other = ShardReader(whole.folder, "demos"), ShardReader(request_.folder, "demos")
     assert len(one) > 0
@@ -60,17 +60,17 @@ def test_an_interrupted_run_continues_to_the_same_rows(
 
 
 @pytest.fixture
-def in_words(request_: CorrectionRequest, monkeypatch: pytest.MonkeyPatch) -> CorrectionRequest:
+def in_words(request_: DaggerRequest, monkeypatch: pytest.MonkeyPatch) -> DaggerRequest:
     def reader(moments: Sequence[Mapping[str, Any]]) -> list[PlanStep | None]:
         return [None if moment["step"] % 3 == 2 else PlanStep.parse(f"Pick(left, {moment['known'][-1]})") for moment in moments]
 
-    monkeypatch.setattr(dagger, "student_in_words", lambda model: reader)
-    return dataclasses.replace(request_, kind="exercises", episodes=6)
+    monkeypatch.setattr(dagger, "student_in_text", lambda model: reader)
+    return dataclasses.replace(request_, kind="text_planning", episodes=6)
 
 
-def test_corrections_in_words_are_exercises(in_words: CorrectionRequest) -> None:
-    collect_corrections(in_words, workers=1)
-    reader = ShardReader(in_words.folder, "exercises")
+def test_corrections_in_words_are_exercises(in_words: DaggerRequest) -> None:
+    collect_dagger(in_words, workers=1)
+    reader = ShardReader(in_words.folder, "text_planning")
     rows = [reader[i] for i in range(len(reader))]
     logs = [item["step"] for row in rows for item in row["history"]]
     assert any(step.startswith("Pick(left, ") for step in logs)
@@ -81,20 +81,20 @@ def test_corrections_in_words_are_exercises(in_words: CorrectionRequest) -> None
             assert before["feedback"].endswith((" ok", "NothingHappened")) or before["step"] != after["step"]
 
 
-def test_training_keeps_its_threads(in_words: CorrectionRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_keeps_its_threads(in_words: DaggerRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     threads, seen = torch.get_num_threads(), list[int]()
     asked = dagger._part
     monkeypatch.setattr(dagger, "_part", lambda *job: (seen.append(torch.get_num_threads()), asked(*job))[1])
     try:
         torch.set_num_threads(2)
-        collect_corrections(in_words, workers=1)
+        collect_dagger(in_words, workers=1)
         assert (set(seen), torch.get_num_threads()) == ({1}, 2)
     finally:
         torch.set_num_threads(threads)
 
 
-def test_the_expert_alone_solves_episodes_in_words(in_words: CorrectionRequest) -> None:
-    config = CollectConfig("exercises", "unused", 6, part_size=6, noise=1.0)
+def test_the_expert_alone_solves_episodes_in_words(in_words: DaggerRequest) -> None:
+    config = CollectConfig("text_planning", "unused", 6, part_size=6, noise=1.0)
     rows = dagger._part(config, 0, "unused")
     assert rows == dagger._part(config, 0, "unused")
     assert not [item for row in rows for item in row["history"] if item["feedback"].endswith(("HandOccupied", "HandEmpty"))]

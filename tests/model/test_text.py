@@ -202,14 +202,14 @@ def test_packed_questions_and_motion_exercises(cfg, processor, examples):
 
 
 def test_what_the_body_feels_is_asked_without_an_image() -> None:
-    asked = prompts.felt_body([1, 2], "", "")
+    asked = prompts.body_state_prompt([1, 2], "", "")
     assert [message.role for message in asked] == ["system", "user"]
-    whole = prompts.felt_body([1, 2], "left right", "0.85")
+    whole = prompts.body_state_prompt([1, 2], "left right", "0.85")
     assert [message.text for message in whole if message.role == "assistant"] == ["left right", "0.85"]
     assert whole[:2] == asked
-    assert prompts.felt_body([1, 2], "left right", "")[-1].role == "user"
+    assert prompts.body_state_prompt([1, 2], "left right", "")[-1].role == "user"
     assert not any(message.images for message in whole)
-    assert "hands" in prompts.felt_body([1], "", "", style="full")[-1].text
+    assert "hands" in prompts.body_state_prompt([1], "", "", style="full")[-1].text
 
 
 def test_plan_steps_survive_the_model_text(processor):

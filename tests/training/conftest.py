@@ -142,7 +142,7 @@ def write_demos(folder: Path, episodes: int = 40) -> Path:
     return folder
 
 
-def write_exercises(folder: Path, kind: str = "exercises", episodes: int = 30) -> Path:
+def write_exercises(folder: Path, kind: str = "text_planning", episodes: int = 30) -> Path:
     rows = []
     for episode in range(episodes):
         target = f"{TYPES[episode % len(TYPES)]}_1"
@@ -159,7 +159,7 @@ def write_exercises(folder: Path, kind: str = "exercises", episodes: int = 30) -
                     "known": [target, "CoffeeTable_2"],
                     "history": [{"step": "MoveAhead(0.1)", "feedback": "MoveAhead(0.1) ok"}] * step,
                     "named": [target],
-                    "target": text if kind == "exercises" else ("no", "yes")[step == len(PLAN) - 1],
+                    "target": text if kind == "text_planning" else ("no", "yes")[step == len(PLAN) - 1],
                 }
             )
     writer = ShardWriter(folder, kind, "test")
@@ -206,12 +206,12 @@ def one_thread() -> None:
 
 @pytest.fixture(scope="session")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with `views`, `exercises`, `demos` and `clips`."""
+    """A folder with `views`, `text_planning`, `demos` and `clips`."""
     root = tmp_path_factory.mktemp("shards")
     write_views(root / "views", 60)
     write_demos(root / "demos")
-    write_exercises(root / "exercises")
-    write_exercises(root / "judgements", "judgements")
+    write_exercises(root / "text_planning")
+    write_exercises(root / "goal_questions", "goal_questions")
     write_clips(root / "clips")
     return root
 

@@ -24,11 +24,11 @@ from proprio_mllm.model.groups import train_only
 from proprio_mllm.training import release
 from proprio_mllm.training.alignment import PHASES, AlignmentObjective
 from proprio_mllm.training.pipeline import Pipeline, StageError, variant_model
-from proprio_mllm.training.rollouts import CorrectionRequest, RolloutRequest, read_rollouts, rollout_row
-from proprio_mllm.training.sources import Demos, Exercises, shard_hash
+from proprio_mllm.training.rollouts import DaggerRequest, RolloutRequest, read_rollouts, rollout_row
+from proprio_mllm.training.sources import Demos, TextPlanning, shard_hash
 from proprio_mllm.training.stages import STAGES
 from proprio_mllm.training.stages.alignment import start
-from proprio_mllm.training.stages.inputs import correction_keys, demonstrations, text_rows
+from proprio_mllm.training.stages.inputs import dagger_keys, demonstrations, text_rows
 from proprio_mllm.training.stages.selu import CRITIC, copy_adapter, train_adapter
 
 HELPERS = importlib.util.spec_from_file_location("training_helpers", Path(__file__).with_name("conftest.py"))
@@ -67,14 +67,14 @@ def collect(request: RolloutRequest) -> None:
     writer.finish({})
 
 
-def correct(request: CorrectionRequest, workers: int) -> None:
+def correct(request: DaggerRequest, workers: int) -> None:
     """Scripted corrections in place of the simulator: a student that is right on every second of its steps."""
     assert workers > 0
     source = ShardReader(request.folder.parent / request.kind, request.kind)
     rows = []
     for number in range(12):
         row = dict(source[number])
-        if request.kind == "exercises":
+        if request.kind == "text_planning":
             rows.append({**row, "target": "Lift(Box_1)"})
             continue
         executed = row["target"] if number % 2 else "MoveAhead(0.5)"
@@ -119,18 +119,18 @@ def test_current_stages_are_skipped_and_others_are_not(trained: Pipeline) -> Non
     assert changed.key("base") == trained.key("base")
     assert changed.key("pointmap") != trained.key("pointmap")
     assert changed.key("alignment") != trained.key("alignment")
-    more = dataclasses.replace(trained.cfg.corrections, episodes=5)
-    corrected = Pipeline(STAGES, dataclasses.replace(trained.cfg, corrections=more), collect)
+    more = dataclasses.replace(trained.cfg.dagger, episodes=5)
+    corrected = Pipeline(STAGES, dataclasses.replace(trained.cfg, dagger=more), collect)
     assert corrected.key("base") == trained.key("base")
     assert corrected.key("alignment") != trained.key("alignment")
 
 
 def test_a_new_recipe_makes_older_output_stale(trained: Pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = {name: trained.key(name) for name in ("base", "corrections", "tokenizer", "alignment", "selu")}
+    before = {name: trained.key(name) for name in ("base", "dagger", "tokenizer", "alignment", "selu")}
     for name, recipe in {"base": 99, "alignment": 1, "selu": 1}.items():
         monkeypatch.setattr(type(STAGES[name]), "recipe", recipe)
     changed = {name for name in before if trained.key(name) != before[name]}
-    assert changed == {"base", "corrections", "alignment", "selu"}
+    assert changed == {"base", "dagger", "alignment", "selu"}
 
 
 def test_a_stage_names_what_it_needs(trained: Pipeline, tmp_path: Path) -> None:
@@ -150,10 +150,10 @@ def test_metrics_are_reported(trained: Pipeline) -> None:
     def metrics(stage: str) -> dict[str, float]:
         return json.loads((trained.paths.stage(stage) / "done.json").read_text())["metrics"]
 
-    assert {"side_accuracy", "side_majority", "plan_exact", "exercise_exact", "base/joint/steps"} <= set(metrics("base"))
-    assert metrics("corrections") | {"seconds": 0} == {
+    assert {"side_accuracy", "side_majority", "plan_exact", "text_exact", "base/joint/steps"} <= set(metrics("base"))
+    assert metrics("dagger") | {"seconds": 0} == {
         "episodes": 4.0, "kept_episodes": 4.0, "steps": 12.0, "student_steps": 8.0, "student_as_expert": 0.5,
-        "exercises": 10.0, "exercise_steps": 12.0, "seconds": 0,
+        "text_planning": 10.0, "text_steps": 12.0, "seconds": 0,
     }  # fmt: skip
     assert metrics("pointmap")["point_median_m"] > 0.0
     assert {"clips_mpjpe_mm", "clips_hands_mm", "clips_feet_mm", "bits_per_s", "codes_used", "perplexity"} <= set(
@@ -170,23 +170,23 @@ def test_corrections_follow_the_demonstrations(trained: Pipeline) -> None:
     assert [joined.target(i) for i in (0, count - 1)] == [alone.target(i) for i in (0, count - 1)]
     assert [joined.target(count + i) for i in range(12)] == [alone.target(i) for i in range(12)]
     assert {joined.reader[i]["episode"] for i in joined.finals} > {alone.reader[i]["episode"] for i in alone.finals}
-    none = dataclasses.replace(trained.cfg, corrections=dataclasses.replace(trained.cfg.corrections, episodes=0))
+    none = dataclasses.replace(trained.cfg, dagger=dataclasses.replace(trained.cfg.dagger, episodes=0))
     assert len(demonstrations(Pipeline(STAGES, none), model).motions) == count
-    assert list(correction_keys(Pipeline(STAGES, none))) == ["corrections_in_words"]
+    assert list(dagger_keys(Pipeline(STAGES, none))) == ["dagger_in_text"]
 
 
 def test_half_of_the_steps_in_words_are_corrections(trained: Pipeline) -> None:
     model, rng = trained.cfg.model, np.random.default_rng(0)
     demos = Demos(trained.paths.shards("demos"), model)
 
-    def answers(exercises: Exercises) -> list[str]:
-        return [exercises.draw(rng).messages[-1].text for _ in range(200)]
+    def answers(text_planning: TextPlanning) -> list[str]:
+        return [text_planning.draw(rng).messages[-1].text for _ in range(200)]
 
     assert 70 < answers(text_rows(trained, model, demos)).count("Lift(Box_1)") < 130
-    assert answers(Exercises(trained.paths.shards("exercises"), model, demos)).count("Lift(Box_1)") < 10
-    alone = dataclasses.replace(trained.cfg, corrections=dataclasses.replace(trained.cfg.corrections, exercises=0))
+    assert answers(TextPlanning(trained.paths.shards("text_planning"), model, demos)).count("Lift(Box_1)") < 10
+    alone = dataclasses.replace(trained.cfg, dagger=dataclasses.replace(trained.cfg.dagger, text_planning=0))
     assert Pipeline(STAGES, alone).key("alignment") != trained.key("alignment")
-    assert correction_keys(Pipeline(STAGES, alone))["corrections"] == correction_keys(trained)["corrections"]
+    assert dagger_keys(Pipeline(STAGES, alone))["dagger"] == dagger_keys(trained)["dagger"]
 
 
 def test_the_control_trains_without_motion(trained: Pipeline) -> None:
@@ -224,15 +224,15 @@ def test_a_phase_changes_only_its_groups(trained: Pipeline, phase: str) -> None:
     from proprio_mllm.model.groups import group_of
     from proprio_mllm.model.motion_tokenizer import MotionTokenizer
     from proprio_mllm.training.alignment import AlignmentData
-    from proprio_mllm.training.sources import Clips, Exercises, Judgements, Views
+    from proprio_mllm.training.sources import Clips, GoalQuestions, TextPlanning, Views
 
     model = start(trained)
     shards, cfg = trained.paths.shards, trained.cfg.alignment
     tokenizer = MotionTokenizer.load(trained.paths.model("tokenizer"))
     views, demos = Views(shards("views"), model.cfg), Demos(shards("demos"), model.cfg)
-    exercises = Exercises(shards("exercises"), model.cfg, demos)
-    judgements = Judgements(shards("judgements"), model.cfg)
-    data = AlignmentData(model, tokenizer, Clips(shards("clips")), views, demos, exercises, judgements, cfg)
+    text_planning = TextPlanning(shards("text_planning"), model.cfg, demos)
+    goal_questions = GoalQuestions(shards("goal_questions"), model.cfg)
+    data = AlignmentData(model, tokenizer, Clips(shards("clips")), views, demos, text_planning, goal_questions, cfg)
     train_only(model, PHASES[phase].groups)
     before = {name: tensor.detach().clone() for name, tensor in model.named_parameters()}
     trained.loop(AlignmentObjective(model, data, phase, cfg, "test"), cfg.joint, trained.paths.root / f"groups-{phase}")
@@ -272,7 +272,7 @@ def test_the_same_seed_gives_the_same_weights(trained: Pipeline, shards: Path, t
     torch.manual_seed(12345)
     shutil.copytree(shards, tmp_path / "tiny" / "data")
     again = Pipeline(STAGES, dataclasses.replace(trained.cfg, output=str(tmp_path)), collect, "", correct)
-    for stage in ("base", "corrections", "pointmap", "tokenizer", "alignment"):
+    for stage in ("base", "dagger", "pointmap", "tokenizer", "alignment"):
         again.run(stage)
         torch.rand(1)
     files = [path.relative_to(tmp_path) for path in sorted((tmp_path / "tiny").rglob("*.safetensors"))]
@@ -304,9 +304,9 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     written = release.export(trained, tmp_path)
     assert [folder.name for folder in written] == ["base", "full"]
     about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
-    assert list(about["stages"]) == ["base", "corrections", "pointmap", "tokenizer", "alignment", "selu"]
+    assert list(about["stages"]) == ["base", "dagger", "pointmap", "tokenizer", "alignment", "selu"]
     assert all(stage["command"] == "python train.py stage=all" and stage["metrics"] for stage in about["stages"].values())
-    assert set(about["shards"]) == {"clips", "views", "exercises", "judgements", "demos", "corrections", "corrections_in_words"}
+    assert set(about["shards"]) == {"clips", "views", "text_planning", "goal_questions", "demos", "dagger", "dagger_in_text"}
     ours, released = load_model(trained.paths.model("selu")), load_model(tmp_path / "tiny" / "full")
     theirs = dict(released.named_parameters())
     assert all(tensor.dtype == torch.float32 for tensor in theirs.values())

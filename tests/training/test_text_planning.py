@@ -12,7 +12,7 @@ from configs.schema.model import ModelConfig
 from data.interface.observation import HistoryItem
 from data.motion import HAND_OPENING
 from data.shards import ShardWriter
-from proprio_mllm.training.sources import Bodies, Demos, Exercises
+from proprio_mllm.training.sources import Bodies, Demos, TextPlanning
 from proprio_mllm.training.states import open_hands
 from proprio_mllm.training.text_planning import GROUPS, Exchange, is_symbolic
 from sim.tasks.instructions import natural_name
@@ -87,8 +87,8 @@ def _episode(instruction: str, moments: list[tuple[str, str, list[str]]]) -> lis
     return rows
 
 
-def _learnt(exercises: Exercises, index: int) -> list[str]:
-    asked = exercises.example(index, np.random.default_rng(0)).messages[-2]
+def _learnt(text_planning: TextPlanning, index: int) -> list[str]:
+    asked = text_planning.example(index, np.random.default_rng(0)).messages[-2]
     return [asked.text[start:end] for start, end in asked.learnt]
 
 
@@ -100,25 +100,25 @@ def test_steps_of_the_log_that_the_expert_would_have_taken_are_learnt(shards: Pa
     unsure = _episode("b", [("", go, both), (pick, pick, both), (place, place, both)])
     ups = [f"MoveUp({n}.5)" for n in range(1, 13)]
     long = _episode("c", [(up, up, both) for up in ups])
-    writer = ShardWriter(tmp_path / "exercises", "exercises", "test")
+    writer = ShardWriter(tmp_path / "text_planning", "text_planning", "test")
     writer.write(0, [*first, *hidden, *unsure, *long])
     writer.finish({})
-    exercises = Exercises(tmp_path / "exercises", cfg, Demos(shards / "demos", cfg))
+    text_planning = TextPlanning(tmp_path / "text_planning", cfg, Demos(shards / "demos", cfg))
     # the mistake teaches nothing; the cup, seen last, gives nothing away
-    assert [_learnt(exercises, i) for i in range(4)] == [[], [go], [go], [go, pick]]
+    assert [_learnt(text_planning, i) for i in range(4)] == [[], [go], [go], [go, pick]]
     # the mug in the prompt would give away what the drawer held
-    assert [_learnt(exercises, i) for i in range(4, 7)] == [[], [], [go]]
+    assert [_learnt(text_planning, i) for i in range(4, 7)] == [[], [], [go]]
     # an episode of the same task follows; its first step has no answer
-    assert [_learnt(exercises, i) for i in range(7, 9)] == [[], [pick]]
+    assert [_learnt(text_planning, i) for i in range(7, 9)] == [[], [pick]]
     # of a log that is cut off, the steps that have four others before them
-    assert _learnt(exercises, 9 + 11) == ups[7:11]
-    assert exercises.example(9 + 11, np.random.default_rng(0), answered=False).messages[-1].learnt == ()
+    assert _learnt(text_planning, 9 + 11) == ups[7:11]
+    assert text_planning.example(9 + 11, np.random.default_rng(0), answered=False).messages[-1].learnt == ()
 
 
 def test_exercises_in_words_ask_for_steps_names_and_states(shards: Path, cfg: ModelConfig) -> None:
-    exercises = Exercises(shards / "exercises", cfg, Demos(shards / "demos", cfg))
+    text_planning = TextPlanning(shards / "text_planning", cfg, Demos(shards / "demos", cfg))
     rng = np.random.default_rng(0)
-    drawn = [exercises.draw(rng) for _ in range(120)]
+    drawn = [text_planning.draw(rng) for _ in range(120)]
     assert not any(example.views for example in drawn)
     endings = [example.messages[-2].text.splitlines()[-1].split(" ")[0] for example in drawn]
     assert 10 < endings.count("named?") < 40
@@ -156,10 +156,14 @@ def test_steps_in_words_get_motion_whose_hands_agree_with_the_log(shards: Path, 
     assert bodies.draw(empty, rng) == tokens[demos.split.train[0]].tolist()
     assert bodies.draw(left_full, rng) is None
     assert sum(len(rows) for rows in bodies.grips) == len(demos.split.train)
-    exercises = Exercises(shards / "exercises", cfg, demos)
-    shown = [len(re.findall(r"<motion_\d+>", exercises.draw(rng, bodies).messages[1].text)) for _ in range(40)]
+    text_planning = TextPlanning(shards / "text_planning", cfg, demos)
+    shown = [len(re.findall(r"<motion_\d+>", text_planning.draw(rng, bodies).messages[1].text)) for _ in range(40)]
     assert {0, 4} <= set(shown)
-    plain = [exercises.draw(rng).messages[1].text for _ in range(40)]
+    plain = [text_planning.draw(rng).messages[1].text for _ in range(40)]
     assert not any("<motion" in text for text in plain)
-    index = next(i for i in range(len(exercises.reader)) if len(exercises.reader[i]["history"]) == exercises.reader[i]["step"])
-    assert bodies.draw({**exercises.reader[index], "step": 99}, rng) is None
+    index = next(
+        i
+        for i in range(len(text_planning.reader))
+        if len(text_planning.reader[i]["history"]) == text_planning.reader[i]["step"]
+    )
+    assert bodies.draw({**text_planning.reader[index], "step": 99}, rng) is None

@@ -11,7 +11,7 @@ from typing import Final
 from proprio_mllm.training.pipeline import Stage
 from proprio_mllm.training.stages.alignment import AlignmentStage
 from proprio_mllm.training.stages.base import BaseStage
-from proprio_mllm.training.stages.corrections import CorrectionsStage
+from proprio_mllm.training.stages.dagger import DaggerStage
 from proprio_mllm.training.stages.pointmap import PointMapStage
 from proprio_mllm.training.stages.selu import SeluStage
 from proprio_mllm.training.stages.tokenizer import TokenizerStage
@@ -20,7 +20,7 @@ __all__ = ["STAGES"]
 
 STAGES: Final[Mapping[str, Stage]] = {
     "base": BaseStage(),
-    "corrections": CorrectionsStage(),
+    "dagger": DaggerStage(),
     "pointmap": PointMapStage(),
     "tokenizer": TokenizerStage(),
     "alignment": AlignmentStage(),

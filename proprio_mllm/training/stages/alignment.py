@@ -14,9 +14,9 @@ from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, body_state_accuracy
-from proprio_mllm.training.base import exercise_accuracy, grounding_accuracy, plan_accuracy
+from proprio_mllm.training.base import grounding_accuracy, plan_accuracy, text_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded, variant_model
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Judgements, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, GoalQuestions, Views
 from proprio_mllm.training.stages.inputs import demonstrations, text_rows
 
 __all__ = ["AlignmentStage", "start"]
@@ -26,8 +26,8 @@ class AlignmentStage:
     """The phases of `PHASES`, each a loop over its own parameter groups."""
 
     name = "alignment"
-    needs = ("base", "corrections", "pointmap", "tokenizer")
-    shards = ("judgements",)
+    needs = ("base", "dagger", "pointmap", "tokenizer")
+    shards = ("goal_questions",)
     recipe = 5
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
@@ -41,10 +41,10 @@ class AlignmentStage:
         model = start(pipeline)
         tokenizer = MotionTokenizer.load(pipeline.paths.model("tokenizer"))
         views, demos = Views(pipeline.paths.shards("views"), model.cfg), demonstrations(pipeline, model.cfg)
-        exercises = text_rows(pipeline, model.cfg, demos)
-        judgements = Judgements(pipeline.paths.shards("judgements"), model.cfg)
+        text_planning = text_rows(pipeline, model.cfg, demos)
+        goal_questions = GoalQuestions(pipeline.paths.shards("goal_questions"), model.cfg)
         clips = Clips(pipeline.paths.shards("clips"))
-        data = AlignmentData(model, tokenizer, clips, views, demos, exercises, judgements, pipeline.cfg.alignment)
+        data = AlignmentData(model, tokenizer, clips, views, demos, text_planning, goal_questions, pipeline.cfg.alignment)
         # without proprioception there is nothing to align apart
         wanted = PHASES if model.cfg.proprioception else ("joint",)
         loops = {phase: getattr(pipeline.cfg.alignment, phase) for phase in wanted}
@@ -57,7 +57,7 @@ class AlignmentStage:
         save_model(model.eval(), pipeline.paths.model("alignment"), read)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
         felt = body_state_accuracy(model, demos, read) if read is not None else {}
-        return {**asked, **felt, **plan_accuracy(model, demos, read), **exercise_accuracy(model, exercises, data.bodies)}
+        return {**asked, **felt, **plan_accuracy(model, demos, read), **text_accuracy(model, text_planning, data.bodies)}
 
 
 def start(pipeline: Pipeline) -> ProprioMLLM:

@@ -11,9 +11,9 @@ from typing import Any
 from proprio_mllm.model.building import build_model, build_processor, save_model
 from proprio_mllm.model.dense import DenseHead
 from proprio_mllm.model.groups import train_only
-from proprio_mllm.training.base import DenseObjective, JointObjective, exercise_accuracy, grounding_accuracy, plan_accuracy
+from proprio_mllm.training.base import DenseObjective, JointObjective, grounding_accuracy, plan_accuracy, text_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config, seeded
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Exercises, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, TextPlanning, Views
 from proprio_mllm.training.text import corpus, start_from_words, whole_words
 
 __all__ = ["BaseStage"]
@@ -26,7 +26,7 @@ class BaseStage:
 
     name = "base"
     needs = ()
-    shards = ("views", "exercises", "demos", "clips")
+    shards = ("views", "text_planning", "demos", "clips")
     recipe = 3
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
@@ -43,8 +43,8 @@ class BaseStage:
             return {}
         views, demos = Views(pipeline.paths.shards("views"), plain), Demos(pipeline.paths.shards("demos"), plain)
         clips = Clips(pipeline.paths.shards("clips"))
-        exercises = Exercises(pipeline.paths.shards("exercises"), plain, demos)
-        texts = corpus(plain, views, demos, exercises, clips, cfg.seed)
+        text_planning = TextPlanning(pipeline.paths.shards("text_planning"), plain, demos)
+        texts = corpus(plain, views, demos, text_planning, clips, cfg.seed)
         model = build_model(plain, build_processor(plain, texts, whole_words(views)), cfg.seed)
         start_from_words(model, views.type_names)
         head = seeded(lambda: DenseHead(model, views.type_names), cfg.seed)
@@ -55,8 +55,8 @@ class BaseStage:
             parameter.requires_grad_(id(parameter) in chosen)
         pipeline.loop(dense, cfg.base.dense, folder / "dense")
         model.requires_grad_(True)
-        joint = JointObjective(model, head, views, demos, exercises, clips, cfg.base, f"{key}/joint")
+        joint = JointObjective(model, head, views, demos, text_planning, clips, cfg.base, f"{key}/joint")
         pipeline.loop(joint, cfg.base.joint, folder / "joint")
         save_model(model.eval(), pipeline.paths.model("base"))
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE))
-        return {**asked, **plan_accuracy(model, demos), **exercise_accuracy(model, exercises)}
+        return {**asked, **plan_accuracy(model, demos), **text_accuracy(model, text_planning)}

@@ -44,7 +44,7 @@ from proprio_mllm.training.goals import Relabel
 from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.pipeline import Metrics, Pipeline
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
-from proprio_mllm.training.sources import Bodies, Judgements
+from proprio_mllm.training.sources import Bodies, GoalQuestions
 from proprio_mllm.training.stages.inputs import demonstrations, text_rows
 
 __all__ = ["ACTOR", "CRITIC", "ExampleObjective", "SeluStage", "copy_adapter", "train_adapter"]
@@ -151,8 +151,8 @@ class _Selu:
             copy_adapter(self.model, ACTOR, CRITIC)
         self.collator = Collator(self.model.processor, self.model.cfg)
         self.demos = demonstrations(self.pipeline, self.model.cfg)
-        self.judgements = Judgements(self.pipeline.paths.shards("judgements"), self.model.cfg)
-        self.exercises = text_rows(self.pipeline, self.model.cfg, self.demos)
+        self.goal_questions = GoalQuestions(self.pipeline.paths.shards("goal_questions"), self.model.cfg)
+        self.text_planning = text_rows(self.pipeline, self.model.cfg, self.demos)
         self._tokens = None if self.tokenizer is None else self.demos.tokens(self.tokenizer)
         self._bodies = None if self._tokens is None else Bodies(self.demos, self._tokens)
 
@@ -161,13 +161,13 @@ class _Selu:
 
     def _judging(self, rng: np.random.Generator) -> Example:
         if rng.random() < IN_WORDS:
-            return self.judgements.draw(rng)
+            return self.goal_questions.draw(rng)
         index = int(self.demos.draw(rng, 1)[0])
         return judge_example(self.demos, index, rng, self._tokens)
 
     def _planning(self, rng: np.random.Generator) -> Example:
-        if rng.random() < self.pipeline.cfg.alignment.exercise_share:
-            return self.exercises.draw(rng, self._bodies)
+        if rng.random() < self.pipeline.cfg.alignment.text_share:
+            return self.text_planning.draw(rng, self._bodies)
         index = int(self.demos.draw(rng, 1)[0])
         return self.demos.example(index, self._codes(index))
 

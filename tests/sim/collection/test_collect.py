@@ -13,7 +13,7 @@ from data.interface.steps import Action, PlanStep
 from data.motion import N_FEATURES
 from data.shards import ShardReader, decode_depth, decode_png, decode_segmentation
 from sim.collection.collect import collect, main, parts_of, rows_of_part
-from sim.collection.demonstrations import perturbed, run_correction, run_episode
+from sim.collection.demonstrations import perturbed, run_dagger_episode, run_episode
 from sim.collection.view_sampling import type_names
 
 VIEWS = CollectConfig("views", "unused", 6, part_size=3, views_per_world=3, image_size=56)
@@ -101,8 +101,8 @@ def test_a_students_mistakes_are_recorded_with_the_experts_step():
     def student(observation):
         return PlanStep((Action("Place", arm=Arm.RIGHT, object_id=observation.known_objects[0]),))
 
-    episode = run_correction(config, 10, None, student)
-    again = run_correction(config, 10, None, student)
+    episode = run_dagger_episode(config, 10, None, student)
+    again = run_dagger_episode(config, 10, None, student)
     for name in ("target", "image", "history", "privileged"):
         assert [row[name] for row in episode.rows] == [row[name] for row in again.rows]
     assert episode.success
@@ -112,7 +112,7 @@ def test_a_students_mistakes_are_recorded_with_the_experts_step():
     assert {row["target"] for row in episode.rows} <= {note["executed"] for note in notes if note["origin"] == "expert"}
     # a step that has just failed is not tried again: the expert takes over
     assert [note["origin"] for note in notes[:2]] == ["student", "expert"]
-    assert run_correction(config, 10, None, lambda observation: None).rows[-1]["target"] == episode.rows[-1]["target"]
+    assert run_dagger_episode(config, 10, None, lambda observation: None).rows[-1]["target"] == episode.rows[-1]["target"]
 
 
 class _Seen:
@@ -136,7 +136,7 @@ def test_perturbed_steps_are_legal_and_differ(step):
 
 def test_arguments_are_read_and_wrong_ones_refused(capsys):
     assert read_arguments(CollectConfig, ["kind=views", "out=x", "count=3", "robots=[x1]"]).robots == ("x1",)
-    with pytest.raises(ConfigError, match="views, demos, exercises, judgements"):
+    with pytest.raises(ConfigError, match="views, demos, text_planning, goal_questions"):
         read_arguments(CollectConfig, ["kind=pictures", "out=x", "count=3"])
     with pytest.raises(ConfigError, match="'count' is not key=value"):
         read_arguments(CollectConfig, ["count"])

@@ -13,34 +13,34 @@ from configs.schema.collect import CollectConfig
 from data.interface.actions import ACTIONS
 from data.interface.steps import Action, PlanStep
 from sim.collection.collect import rows_of_part
-from sim.collection.text_planning import Exercise, corrections_of_part, play
+from sim.collection.text_planning import TextEpisode, dagger_of_part, play
 from sim.scene.catalogue import load_catalogue
 from sim.tasks.families import FAMILIES
 
 #: Types that a hand picks up.
 SMALL = {kind.name for kind in load_catalogue().types.values() if kind.pickupable}
-CONFIG = CollectConfig("exercises", "unused", 300, part_size=300)
+CONFIG = CollectConfig("text_planning", "unused", 300, part_size=300)
 
 
 @pytest.fixture(scope="module")
-def episodes() -> list[Exercise]:
+def episodes() -> list[TextEpisode]:
     return [play(CONFIG, index) for index in range(300)]
 
 
-def test_an_episode_is_a_function_of_its_number(episodes: list[Exercise]) -> None:
+def test_an_episode_is_a_function_of_its_number(episodes: list[TextEpisode]) -> None:
     assert play(CONFIG, 7).rows == episodes[7].rows
     assert rows_of_part(CONFIG, 0) == [row for episode in episodes for row in episode.rows]
     assert episodes[7].rows != episodes[8].rows
 
 
-def test_most_episodes_end_in_success_in_spite_of_mistakes(episodes: list[Exercise]) -> None:
+def test_most_episodes_end_in_success_in_spite_of_mistakes(episodes: list[TextEpisode]) -> None:
     assert sum(episode.success for episode in episodes) > 270
     codes = set().union(*(episode.codes for episode in episodes))
     wanted = {"ok", "TooFar", "BodyTooHigh", "BodyTooLow", "HandEmpty", "HandOccupied", "AlreadyHeld", "AlreadyInState"}
     assert wanted | {"ObjectNotKnown", "BothHandsBusy", "GraspMissed"} <= codes
 
 
-def test_every_family_and_every_action_occurs(episodes: list[Exercise]) -> None:
+def test_every_family_and_every_action_occurs(episodes: list[TextEpisode]) -> None:
     more = [*episodes, *(play(CONFIG, 1000 + index) for index in range(700))]
     history = (item for episode in more for moment in episode.moments for item in moment["history"][-1:] if item["step"])
     steps = [action.name for item in history for action in PlanStep.parse(item["step"]).actions]
@@ -51,13 +51,13 @@ def test_every_family_and_every_action_occurs(episodes: list[Exercise]) -> None:
         assert sum(some) > 0.5 * len(some), family
 
 
-def test_codes_are_those_of_the_table(episodes: list[Exercise]) -> None:
+def test_codes_are_those_of_the_table(episodes: list[TextEpisode]) -> None:
     for item in (item for episode in episodes for item in episode.moments[-1]["history"]):
         for text, _, code in (outcome.rpartition(" ") for outcome in item["feedback"].split("; ")):
             assert code == "ok" or code in Action.parse(text).spec.codes, item
 
 
-def test_steps_name_known_objects_and_follow_from_the_log(episodes: list[Exercise]) -> None:
+def test_steps_name_known_objects_and_follow_from_the_log(episodes: list[TextEpisode]) -> None:
     heights = 0
     for row in (row for episode in episodes for row in episode.rows):
         step = PlanStep.parse(row["target"])
@@ -76,8 +76,8 @@ def test_steps_name_known_objects_and_follow_from_the_log(episodes: list[Exercis
     assert heights > 20
 
 
-def test_judgements_are_balanced_and_true(episodes: list[Exercise]) -> None:
-    rows = rows_of_part(dataclasses.replace(CONFIG, kind="judgements"), 0)
+def test_judgements_are_balanced_and_true(episodes: list[TextEpisode]) -> None:
+    rows = rows_of_part(dataclasses.replace(CONFIG, kind="goal_questions"), 0)
     assert len(rows) == 300
     assert 0.4 < sum(row["target"] == "yes" for row in rows) / len(rows) < 0.6
     for episode, row in zip(episodes, rows, strict=True):
@@ -90,7 +90,7 @@ def test_judgements_are_balanced_and_true(episodes: list[Exercise]) -> None:
             assert not episode.success or row["step"] < ends["step"] or row["instruction"] != ends["instruction"]
 
 
-def test_what_is_held_already_is_not_picked_again(episodes: list[Exercise]) -> None:
+def test_what_is_held_already_is_not_picked_again(episodes: list[TextEpisode]) -> None:
     for row in (row for episode in episodes for row in episode.rows):
         if row["history"] and row["history"][-1]["feedback"].endswith("AlreadyHeld"):
             asked = re.findall(r"Pick\(\w+, (\w+)\)", row["history"][-1]["step"])
@@ -107,7 +107,7 @@ def test_what_a_student_picks_up_for_nothing_is_put_back() -> None:
         return steps
 
     config = dataclasses.replace(CONFIG, count=60, part_size=60, noise=0.0)
-    rows = list(corrections_of_part(config, 0, student))
+    rows = list(dagger_of_part(config, 0, student))
     back = 0
     for row in rows:
         last = row["history"][-1]["feedback"] if row["history"] else ""
