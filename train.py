@@ -13,6 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Literal
 
 from configs.app import run_app
@@ -51,7 +52,7 @@ def make_shards(cfg: TrainConfig) -> None:
         out = StagePaths(cfg).shards(kind)
         shards = ShardConfig(
             kind=kind, out=str(out), count=count, seed=cfg.seed, image_size=cfg.model.image_size, part_size=part,
-            workers=cfg.collect.workers,
+            workers=cfg.collect.workers, robots=cfg.data.robots,
         )  # fmt: skip
         collect(shards, overwrite=cfg.overwrite, progress=_progress(kind))
 
@@ -86,7 +87,8 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
     command = " ".join(["python train.py", *sys.argv[1:]])
-    pipeline = Pipeline(STAGES, cfg, _rollouts, command, _dagger)
+    robots = cfg.data.robots
+    pipeline = Pipeline(STAGES, cfg, partial(_rollouts, robots=robots), command, partial(_dagger, robots=robots))
     wanted = tuple(STAGES) if cfg.stage == "all" else (cfg.stage,)
     metrics = {name: pipeline.run(name) for name in wanted}
     if cfg.release is not None:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Final
 from tqdm import tqdm
 
 from configs.schema.collect import CollectConfig
+from data.interface.bodies import PAPER_ROBOTS
 from data.interface.observation import Observation
 from data.interface.steps import PlanStep
 from data.shards import ShardWriter
@@ -39,7 +40,7 @@ __all__ = ["collect_dagger", "student_in_text"]
 _PER_PART: Final[dict[str, int]] = {"demos": 10, "text_planning": 50}
 
 
-def collect_dagger(request: DaggerRequest, robots: Sequence[str] = ("h1", "x1"), workers: int = 2) -> None:
+def collect_dagger(request: DaggerRequest, robots: Sequence[str] = PAPER_ROBOTS, workers: int = 2) -> None:
     """Lets the model act and writes a complete shard folder; an interrupted one is continued part by part.
 
     Args:

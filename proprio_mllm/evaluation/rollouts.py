@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from configs.schema.eval import DifficultyName, PlannerConfig
 from configs.schema.robot import RobotConfig
+from data.interface.bodies import PAPER_ROBOTS
 from data.shards import ShardWriter
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
 from proprio_mllm.evaluation.pool import run_jobs
@@ -46,7 +47,7 @@ def training_tasks(count: int, seed: int) -> list[Task]:
 def collect_rollouts(
     request: RolloutRequest,
     tasks: Sequence[Task] | None = None,
-    robots: Sequence[str] = ("h1", "x1"),
+    robots: Sequence[str] = PAPER_ROBOTS,
     difficulty: DifficultyName = "natural",
     workers: int = 2,
     opener: Opener | None = None,

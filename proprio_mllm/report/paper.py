@@ -11,6 +11,8 @@ from typing import Any, Final
 
 import yaml
 
+from data.interface.bodies import PAPER_ROBOTS
+
 __all__ = ["PAPER_ROWS", "paper_ablation", "paper_main", "paper_replanning"]
 
 #: Rows of the paper's tables that stand beside a planner of ours: planner name to (Table II, Table III, Table IV).
@@ -28,7 +30,9 @@ PAPER_ROWS: Final[Mapping[str, tuple[str | None, str | None, str | None]]] = {
     "rap": ("RAP", None, None),
     "dag_plan": ("DAG-Plan", "DAG-Plan", None),
 }
-_COLUMNS: Final = tuple((category, robot) for category in ("essential", "optional", "single") for robot in ("x1", "h1"))
+_COLUMNS: Final = tuple(
+    (category, robot) for category in ("essential", "optional", "single") for robot in reversed(PAPER_ROBOTS)
+)
 
 
 @functools.cache

@@ -15,9 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from data.interface.bodies import Arm
+from data.interface.bodies import PAPER_ROBOTS, Arm
 from sim.tasks.families import family_of
-from sim.tasks.sample import ROBOTS
 from sim.tasks.task import BENCHMARK_PATH, MAX_STEPS, Task
 
 __all__ = [
@@ -132,7 +131,7 @@ def one_armed_steps(task: Task, certificate: Certificate) -> dict[str, int | Non
     return found
 
 
-def certified(task: Task, robots: Sequence[str] = ROBOTS) -> tuple[Task, tuple[Certificate, ...]]:
+def certified(task: Task, robots: Sequence[str] = PAPER_ROBOTS) -> tuple[Task, tuple[Certificate, ...]]:
     """The task with its budget, and a certificate per robot.
 
     Raises:

@@ -21,6 +21,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data.interface.bodies import DEFAULT_ROBOT
 from data.interface.failures import FailureCode
 from data.interface.feedback import ActionOutcome
 from data.interface.steps import Action, PlanStep
@@ -127,7 +128,7 @@ class Controller:
 
     def __init__(
         self,
-        robot_type: str = "h1",
+        robot_type: str = DEFAULT_ROBOT,
         scene: str = "kitchen_1",
         width: int = 300,
         height: int = 300,

@@ -24,7 +24,7 @@ from typing import Any, Final
 import imageio.v3 as iio
 import numpy as np
 
-from data.interface.bodies import Arm
+from data.interface.bodies import PAPER_ROBOTS, Arm
 from data.interface.feedback import ActionOutcome
 from data.interface.steps import PlanStep
 from sim.interfaces.aliases import to_action
@@ -75,7 +75,7 @@ class Controller:
         self,
         config_path: str = "config.json",
         start_unity_exe: bool = True,
-        robot_type: str = "x1",
+        robot_type: str = PAPER_ROBOTS[1],
         scene: str = "kitchen",
         host: str = "localhost",
         port: int = 5678,
@@ -125,7 +125,7 @@ class Controller:
         self._open(self.session.robot.name, self._scene)
         return self._reply("resetscene", True, "")
 
-    def reset_scene(self, scene: str, robottype: str = "x1") -> Reply:
+    def reset_scene(self, scene: str, robottype: str = PAPER_ROBOTS[1]) -> Reply:
         """Starts another scene, with another robot."""
         self._open(robottype, scene)
         return self._reply("resetscene", True, "")

@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from data.interface.bodies import KEY_BODIES
+from data.interface.bodies import DEFAULT_ROBOT, KEY_BODIES
 from data.interface.observation import Observation
 from data.interface.steps import ActionError, PlanStep
 from data.motion import N_FEATURES
@@ -45,7 +45,7 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012  # Gymnasium's own name and form
 
     def __init__(
-        self, robot: str = "h1", tasks: Sequence[TaskLike] = (), difficulty: str = "easy", image_size: int = 112,
+        self, robot: str = DEFAULT_ROBOT, tasks: Sequence[TaskLike] = (), difficulty: str = "easy", image_size: int = 112,
         render_mode: str | None = None, contingency: str = "default",
     ) -> None:  # fmt: skip
         if render_mode not in (None, "rgb_array"):

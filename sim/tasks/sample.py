@@ -15,6 +15,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from data.interface.bodies import PAPER_ROBOTS
 from sim.robots.build_solver import robot_kit
 from sim.robots.spec import load_robot
 from sim.scene.catalogue import ObjectType, load_catalogue
@@ -31,7 +32,6 @@ from sim.world.world import World, WorldError
 __all__ = [
     "BENCHMARK_SEEDS",
     "BIG_TYPES",
-    "ROBOTS",
     "ROOMS",
     "TRAIN_ROOMS",
     "TRAIN_SEEDS",
@@ -47,7 +47,6 @@ TRAIN_ROOMS: Final = ("kitchen_1", "kitchen_2", "living_room_1", "living_room_2"
 ROOMS: Final = room_names()
 #: Movable types that occur in no training task.
 UNSEEN_TYPES: Final = ("Kettle", "Tomato", "Pan", "WineBottle", "AlarmClock", "Vase", "HandTowel", "PepperShaker")
-ROBOTS: Final = ("h1", "x1")
 #: Seeds of the benchmark's draws; training seeds start where they end.
 BENCHMARK_SEEDS: Final = range(0, 100_000)
 TRAIN_SEEDS: Final = range(100_000, 2**31)
@@ -158,7 +157,7 @@ def sample_task(
     room: str | None = None,
     family: str | None = None,
     source: str = "train",
-    robots: Sequence[str] = ROBOTS,
+    robots: Sequence[str] = PAPER_ROBOTS,
 ) -> Task:
     """A task drawn from a seed.
 
@@ -195,7 +194,7 @@ def sample_task(
 
 
 def settle(
-    draft: Draft, task_id: str, seed: int, source: str, rng: np.random.Generator, robots: Sequence[str] = ROBOTS
+    draft: Draft, task_id: str, seed: int, source: str, rng: np.random.Generator, robots: Sequence[str] = PAPER_ROBOTS
 ) -> Task:
     """Gives a draft positions, a start, words and a budget.
 
@@ -259,7 +258,7 @@ def room_start(room: str) -> Start:
     """Where every benchmark task of a room starts: fixed within a room, heights vary between rooms."""
     x, y, yaw_deg = load_room(room).start
     share = float(rng_for("start", room).choice((0.0, 0.5, 1.0)))
-    return Start(x, y, yaw_deg, {name: start_height_m(name, share) for name in ROBOTS})
+    return Start(x, y, yaw_deg, {name: start_height_m(name, share) for name in PAPER_ROBOTS})
 
 
 @functools.cache
@@ -370,7 +369,7 @@ def _draw_start(navigation: NavigationMap, target: NDArray[np.float64], rng: np.
         exact = np.rad2deg(np.arctan2(target[1] - y, target[0] - x))
         yaw_deg = float(np.round((exact + rng.uniform(-20.0, 20.0)) / 5.0) * 5.0)
     share = float(rng.choice((0.0, 0.5, 1.0)))
-    return Start(round(float(x), 3), round(float(y), 3), yaw_deg, {name: start_height_m(name, share) for name in ROBOTS})
+    return Start(round(float(x), 3), round(float(y), 3), yaw_deg, {name: start_height_m(name, share) for name in PAPER_ROBOTS})
 
 
 def start_height_m(robot: str, share: float) -> float:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from configs.arguments import read_arguments
 from configs.validate import ConfigError
+from data.interface.bodies import DEFAULT_ROBOT
 from data.interface.steps import Action, PlanStep
 from sim.expert.expert import Expert
 from sim.robots.spec import available_robots, load_robot
@@ -31,7 +32,7 @@ from sim.world.world import World
 __all__ = ["contact_sheet", "lid_sheet", "main", "robot_poses", "room_pictures", "room_sheet"]
 
 
-def room_pictures(folder: Path, robot: str = "h1") -> list[Path]:
+def room_pictures(folder: Path, robot: str = DEFAULT_ROBOT) -> list[Path]:
     """Overview, plan, head view at 500 and 112 pixels and side view of every room with its default objects."""
     written: list[Path] = []
     for room in room_names():

@@ -22,6 +22,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from configs.arguments import read_arguments
 from configs.validate import ConfigError
+from data.interface.bodies import DEFAULT_ROBOT
 from data.interface.steps import ActionError, PlanStep
 from sim.expert.expert import Expert
 from sim.session.session import FreePlay, Session, TaskLike
@@ -55,7 +56,7 @@ class VideoConfig:
     """
 
     out: str
-    robot: str = "h1"
+    robot: str = DEFAULT_ROBOT
     room: str = "kitchen_1"
     task: str | None = None
     plan: tuple[str, ...] = ()

@@ -5,12 +5,13 @@ from collections import Counter
 
 import pytest
 
+from data.interface.bodies import PAPER_ROBOTS
 from sim.benchmark.certificates import budget_of, certificates_text, load_certificates
 from sim.benchmark.composition import COMPOSITION
 from sim.benchmark.generate import Slot, counts, main, moved, named_types, rebuild, slots
 from sim.scene.catalogue import load_catalogue
 from sim.tasks.families import FAMILIES
-from sim.tasks.sample import BENCHMARK_SEEDS, ROBOTS, TRAIN_ROOMS, room_start, scene_of
+from sim.tasks.sample import BENCHMARK_SEEDS, TRAIN_ROOMS, room_start, scene_of
 from sim.tasks.task import BENCHMARK_PATH, load_benchmark, tasks_text
 
 TASKS = load_benchmark()
@@ -55,7 +56,7 @@ def test_files_are_in_their_canonical_form():
 
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.id)
 def test_certificates_say_what_the_category_promises(task):
-    proofs = [CERTIFICATES[task.id, robot] for robot in ROBOTS]
+    proofs = [CERTIFICATES[task.id, robot] for robot in PAPER_ROBOTS]
     steps = [len(proof.plan) for proof in proofs]
     alone = [min((n for n in proof.one_arm_steps.values() if n is not None), default=None) for proof in proofs]
     if task.category == "essential":

@@ -1,0 +1,103 @@
+"""The map of CONTRIBUTING.md is true: what it lists is enough, and nothing else has to be touched."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sim.robots.spec import load_robot
+from tests.extension.additions import QUANTIZER, SKILL, STAGE, Addition
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("configs", "data", "sim", "proprio_mllm")
+
+
+def touched(row: str, name: str) -> set[str]:
+    """The files that the map lists for a kind of addition."""
+    lines = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").splitlines()
+    (line,) = [line for line in lines if line.startswith(f"| {row} |")]
+    return {path.replace("NAME", name) for path in re.findall(r"`([^`]+)`", line.split("|")[2])}
+
+
+def ran(code: str, root: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """A program in a checkout."""
+    environment = os.environ | {"PYTHONPATH": str(root), "WANDB_MODE": "disabled"} | variables
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments], cwd=root, env=environment, capture_output=True, text=True, timeout=280
+    )
+
+
+@pytest.mark.parametrize("addition", [SKILL, QUANTIZER, STAGE], ids=lambda addition: addition.name)
+def test_what_the_map_lists_is_enough(addition: Addition, tmp_path: Path) -> None:
+    assert {edit.path for edit in addition.edits} == touched(addition.row, addition.name)
+    assert len({edit.path for edit in addition.edits}) <= 4
+    root = tmp_path / "checkout"
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__", "*.stl", "*.obj"))
+    for mesh in (path for path in (ROOT / "sim").rglob("*") if path.suffix in (".stl", ".obj")):
+        copy = root / mesh.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.symlink_to(mesh)
+    for name in ("train.py", "eval.py", "pyproject.toml"):
+        shutil.copy(ROOT / name, root / name)
+    (root / "weights").symlink_to(ROOT / "weights")
+    for edit in addition.edits:
+        (root / edit.path).parent.mkdir(parents=True, exist_ok=True)
+        edit.apply(root)
+    done = ran(addition.program, root, str(tmp_path / "outputs"))
+    assert done.stdout.endswith("works\n"), done.stderr[-3000:]
+    own = next(edit.path for edit in addition.edits if edit.path.startswith("tests/"))
+    checked = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", own], cwd=root,
+        env=os.environ | {"PYTHONPATH": str(root)}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert checked.returncode == 0, checked.stdout[-2000:]
+
+
+@pytest.fixture
+def assets(tmp_path: Path) -> Path:
+    """A third robot: the shorter one of the paper under another name, with a lighter load."""
+    model = load_robot("x1")
+    description = Path(model.mjcf_path).parents[2] / "specs" / "x1.yaml"
+    values = yaml.safe_load(description.read_text(encoding="utf-8"))
+    folder = tmp_path / "assets" / "robots"
+    folder.mkdir(parents=True)
+    (folder / "stubby.xml").write_text(model.mjcf_path.read_text(encoding="utf-8"), encoding="utf-8")
+    values |= {"name": "stubby", "mjcf": "stubby.xml", "two_arm_max_load_kg": 6.0}
+    (folder / "stubby.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
+    return tmp_path / "assets"
+
+
+def test_a_third_robot_needs_no_code(assets: Path, tmp_path: Path) -> None:
+    assert touched("a robot", "stubby") >= {"robots/stubby.yaml", "robots/stubby.xml"}
+    code = (
+        "import sys, eval, train\n"
+        "out = 'output=' + sys.argv[1]\n"
+        "assert eval.main(['robot=stubby', 'planner=scripted', 'limit=1', 'workers=1', out]) == 0\n"
+        "words = ['model=tiny', 'budget=debug', 'data.robots=[stubby]', 'data.clips=4', out]\n"
+        "assert train.main(['stage=data', *words]) == 0\n"
+        "assert train.main(['stage=collect', 'collect.views=8', 'collect.episodes=2', *words]) == 0\n"
+        "print('works')\n"
+    )
+    done = ran(code, ROOT, str(tmp_path / "outputs"), DUALTHOR_ASSETS=str(assets))
+    assert done.stdout.endswith("works\n"), done.stderr[-3000:]
+
+
+def test_a_planner_is_a_file(tmp_path: Path) -> None:
+    planner = tmp_path / "mine.py"
+    planner.write_text((ROOT / "examples" / "own_planner.py").read_text(encoding="utf-8"), encoding="utf-8")
+    code = (
+        "import sys, eval\n"
+        "words = ['planner=file', 'planner.source=' + sys.argv[2] + ':Nearby', 'limit=1', 'workers=1', 'output=' + sys.argv[1]]\n"
+        "assert eval.main(words) == 0\n"
+        "print('works')\n"
+    )
+    done = ran(code, ROOT, str(tmp_path / "outputs"), str(planner))
+    assert done.stdout.endswith("works\n"), done.stderr[-3000:]
