@@ -1,7 +1,7 @@
 """A vision-language checkpoint that answers chats in this process.
 
 Made for Qwen2.5-VL-7B-Instruct and InternVL2.5-8B (its `-hf` form), from a folder on this machine. Calls from many threads are
-answered together (`Gathering`): whenever the model is free it takes what waits, up to `batch`. A row's reply does not depend on
+answered together (`Batcher`): whenever the model is free it takes what waits, up to `batch`. A row's reply does not depend on
 the rows beside it, up to the rounding of sums, which in half precision can tip two tokens that are almost equally likely.
 
 Temperature 0 takes the most likely token, nothing else: the sampling and the repetition penalty that a checkpoint's files
@@ -22,9 +22,9 @@ import torch
 from transformers import LogitsProcessorList, StoppingCriteriaList
 
 from configs.schema.backend import BackendConfig
+from proprio_mllm.backends.batching import Batcher
 from proprio_mllm.backends.checkpoint import Loaded, find_checkpoint, load_checkpoint
 from proprio_mllm.backends.decoding import Limits, Rule, Rules
-from proprio_mllm.backends.gathering import Gathering
 from proprio_mllm.backends.grammar import Grammars, import_xgrammar
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest
@@ -65,12 +65,12 @@ class LocalChat:
         #: Where it runs and with how many tokens of prompt and reply together, for people.
         self.device, self.context = str(model.device), self._loaded.context
         self._encoding = threading.Lock()  # tokenizers are not made for several threads at once
-        self._gathering: Gathering[Row, ChatReply] = Gathering(self._answer, cfg.batch)
+        self._batcher: Batcher[Row, ChatReply] = Batcher(self._answer, cfg.batch)
 
     @property
     def batches(self) -> int:
         """Batches that the model has answered so far."""
-        return self._gathering.batches
+        return self._batcher.batches
 
     def complete(self, request: ChatRequest) -> ChatReply:
         """The reply to a request; the latency counts the wait for the model too.
@@ -84,7 +84,7 @@ class LocalChat:
             self._grammars.compiled(request.schema)  # a schema that has no grammar is this request's error, not its batch's
         with self._encoding:
             row = encode(loaded.processor, request, loaded.context)
-        reply = self._gathering.ask(row)
+        reply = self._batcher.ask(row)
         return ChatReply(
             reply.text,
             reply.prompt_tokens,
@@ -96,7 +96,7 @@ class LocalChat:
 
     def close(self) -> None:
         """Frees the model once the batch under way is answered; calls that wait, and later ones, get an error."""
-        self._gathering.close()
+        self._batcher.close()
         self._loaded = self._grammars = None
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
@@ -106,7 +106,7 @@ class LocalChat:
             raise BackendError(f"{self.model} is closed")
         return self._loaded
 
-    def _answer(self, rows: Sequence[Row]) -> list[ChatReply | BackendError]:
+    def _answer(self, rows: Sequence[Row]) -> list[ChatReply | Exception]:
         """One reply per row, or its error; a batch that does not fit the GPU's memory is halved until it does."""
         try:
             return list(self._generate(self._open(), rows))

@@ -1,23 +1,21 @@
-"""Slots: so many calls to a backend at once, over all threads and processes of a run.
+"""At most so many calls to a backend at once, over all threads and processes of a run.
 
-A slot is a lock on a file, which the operating system gives back when the process that holds it dies. Whoever wants one stands
-in line at a further lock; the first in line alone looks for a free slot, every 20 ms, and the others sleep. A thread that asks
-again stands behind those that wait, so that a busy process cannot keep others out. Needs a Unix system; processes are spawned,
-since a forked one would hold its parent's locks.
-
+A slot is a lock file (`filelock`), which the operating system frees when the process that holds it dies. Whoever wants one
+stands in line at a further lock, so that a busy process cannot keep others out; the first in line alone looks for a free slot.
 Paper: none (engineering).
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import os
+import itertools
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
+
+from filelock import FileLock, Timeout
 
 from proprio_mllm.backends.protocol import Backend, BackendSetupError, ChatReply, ChatRequest
 
@@ -41,17 +39,13 @@ class Slots:
     def __init__(self, count: int, folder: Path | None) -> None:
         if count < 1:
             raise ValueError(f"slots {count} must be positive")
-        self._own: tempfile.TemporaryDirectory[str] | None = None
-        if folder is None:
-            self._own = tempfile.TemporaryDirectory(prefix="slots-")
-            folder = Path(self._own.name)
+        self._own = tempfile.TemporaryDirectory(prefix="slots-") if folder is None else None
+        self._folder = Path(self._own.name) if self._own is not None else Path(folder or "")
+        self._count = count
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise BackendSetupError(f"no folder for slots at {folder}: {error}") from error
-        self._folder = folder
-        self._line = self._folder / "line.lock"
-        self._paths = [self._folder / f"slot{number:04d}.lock" for number in range(count)]
+            raise BackendSetupError(f"no folder for slots at {self._folder}: {error}") from error
 
     @contextlib.contextmanager
     def taken(self) -> Iterator[None]:
@@ -61,38 +55,29 @@ class Slots:
             BackendSetupError: when the lock files cannot be used.
         """
         try:
-            handle = self._take()
+            slot = self._take()
         except OSError as error:
             raise BackendSetupError(f"slots at {self._folder} cannot be used: {error}") from error
         try:
             yield
         finally:
-            os.close(handle)
+            slot.release()
 
     def close(self) -> None:
         """Removes the folder that was made for this process alone."""
         if self._own is not None:
             self._own.cleanup()
 
-    def _take(self) -> int:
-        line = _opened(self._line)
-        try:
-            fcntl.flock(line, fcntl.LOCK_EX)
-            while True:
-                for path in self._paths:
-                    handle = _opened(path)
-                    try:
-                        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    except BlockingIOError:
-                        os.close(handle)
-                    except BaseException:
-                        os.close(handle)
-                        raise
-                    else:
-                        return handle
-                time.sleep(_POLL_S)
-        finally:
-            os.close(line)
+    def _take(self) -> FileLock:
+        with FileLock(self._folder / "line.lock", poll_interval=_POLL_S):
+            for number in itertools.cycle(range(self._count)):
+                slot = FileLock(self._folder / f"slot{number:04d}.lock")
+                with contextlib.suppress(Timeout):
+                    slot.acquire(timeout=0)
+                    return slot
+                if number == self._count - 1:
+                    time.sleep(_POLL_S)
+        raise AssertionError("the cycle of slots ended")
 
 
 class SlottedBackend:
@@ -121,7 +106,3 @@ class SlottedBackend:
         """Closes the slots and the backend that is asked."""
         self._inner.close()
         self._slots.close()
-
-
-def _opened(path: Path) -> int:
-    return os.open(path, os.O_RDWR | os.O_CREAT, 0o666)

@@ -1,9 +1,9 @@
 """Episodes on several processes: each worker has its own simulator, planner and one thread.
 
 Physics and rendering take about as long as the small model (measured: about 0.3 s of one core per step each), so one model per
-worker keeps every core busy. A large model is better asked for many episodes at once: `run_side_by_side` in one process,
-`serving` for many. Workers are spawned, never forked, because torch and GL are loaded. Rows of a batch of one do not depend on
-what else runs, so results do not depend on the number of workers.
+worker keeps every core busy. A large model is better asked for many episodes at once, in this process (`run_here`) or in
+one of its own (`serving`). Workers are spawned, never forked, because torch and GL are loaded. Rows of a batch of one do not
+depend on what else runs, so results do not depend on the number of workers.
 
 A worker that dies takes its pool with it; the pool is made anew, and an episode that was under way when that happened more than
 `retries` times becomes an infrastructure error.
@@ -22,7 +22,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from data.workers import start_worker
 
-__all__ = ["SideBySide", "Worker", "run_jobs", "run_side_by_side"]
+__all__ = ["Worker", "run_here", "run_jobs"]
 
 logger = logging.getLogger(__name__)
 
@@ -100,26 +100,18 @@ def run_jobs(
         yield from _run_pool(make, queue, min(workers, len(queue)), failed, lost, retries)
 
 
-class SideBySide(Protocol[J, R_co]):
-    """Does several jobs at a time in this process."""
-
-    def __call__(self, queue: deque[J], count: int, /) -> Iterator[tuple[J, R_co]]:
-        """Jobs with their results; the queue is emptied, and what is appended meanwhile is done too."""
-        ...
-
-
-def run_side_by_side(
-    run: SideBySide[J, R],
+def run_here(
+    run: Callable[[deque[J], int], Iterator[tuple[J, R]]],
     jobs: Sequence[J],
     count: int,
     failed: Callable[[R], bool],
     name: Callable[[J], Hashable],
     retries: int = 1,
 ) -> Iterator[R]:
-    """As `run_jobs` with no worker process, with up to `count` jobs at a time.
+    """Results of jobs done in this process, up to `count` at a time, in the order they are ready.
 
     Args:
-        run: does them.
+        run: does the jobs of a queue, and what is appended to it meanwhile, so many at a time; gives each with its result.
         jobs: what is to be done, in the order it is started.
         count: jobs at a time.
         failed: whether a result is worth another attempt. Every attempt's result is given out.

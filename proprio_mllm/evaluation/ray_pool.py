@@ -17,7 +17,7 @@ import numpy as np
 from configs.schema.eval import PlannerConfig
 from data.cluster import import_ray
 from data.interface.observation import Observation
-from proprio_mllm.evaluation.batching import AskingPlanner, Batcher, batch_planner
+from proprio_mllm.evaluation.asking import AskingPlanner, ModelDesk, batch_planner
 from proprio_mllm.evaluation.pool import Worker
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
 
@@ -44,19 +44,19 @@ class _ModelActor:
     """Holds the model; its methods are called from many threads."""
 
     def __init__(self, planner: PlannerConfig, batch: int) -> None:
-        self._batcher = Batcher(batch_planner(planner), batch)
+        self._desk = ModelDesk(batch_planner(planner), batch)
 
     def image_size(self) -> int:
         """Side of the image that the planner wants to see."""
-        return self._batcher.image_size
+        return self._desk.image_size
 
     def begin(self, caller: str, task: TaskInfo, rng: np.random.Generator) -> None:
         """Starts an episode of a caller."""
-        self._batcher.begin(caller, task, rng)
+        self._desk.begin(caller, task, rng)
 
     def step(self, caller: str, observation: Observation) -> PlannerReply:
         """The next step of a caller's episode."""
-        return self._batcher.step(caller, observation)
+        return self._desk.step(caller, observation)
 
 
 class RayServer:

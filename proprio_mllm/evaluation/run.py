@@ -33,7 +33,7 @@ from data.interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.backends.factory import check_cap, make_backend, told_revision
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest
-from proprio_mllm.evaluation.batching import batch_planner
+from proprio_mllm.evaluation.asking import batch_planner
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
 from proprio_mllm.evaluation.ledger import EpisodeKey, Ledger, key_of, read_ledger, scored
 from proprio_mllm.evaluation.naming import options_of
@@ -240,7 +240,12 @@ def _resolved(planner: PlannerConfig, backend: BackendConfig | None) -> tuple[Pl
 
 
 def _ready(cfg: EvalConfig) -> EvalConfig:
-    """The configuration with the backend that its planner asks known to be there."""
+    """The configuration with its robot and the backend that its planner asks known to be there."""
+    if cfg.robot.mjcf is not None:
+        raise ValueError(
+            f"robot.mjcf={cfg.robot.mjcf!r}: episodes take another MJCF through a description, robot.spec=FILE.yaml"
+        )
+    load_robot(cfg.robot.spec or cfg.robot.name)  # a wrong description stops here, not in every episode
     backend = cfg.backend
     if backend is None:
         return cfg
@@ -280,54 +285,59 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
         ValueError: when there is no task to run, the robot's description is wrong, `robot.mjcf` is given, or the contingency is
             unknown.
     """
-    if cfg.robot.mjcf is not None:
-        raise ValueError(
-            f"robot.mjcf={cfg.robot.mjcf!r}: episodes take another MJCF through a description, robot.spec=FILE.yaml"
-        )
-    load_robot(cfg.robot.spec or cfg.robot.name)  # a wrong description stops here, not in every episode
     cfg = _ready(cfg)
     planner, digest = _resolved(cfg.planner, cfg.backend)
-    if cfg.scheduler == "ray":
-        import_ray(cfg.ray_address)  # a missing extra stops here, before anything is written
-    if cfg.batch > 1 and planner.kind == "file":
-        batch_planner(planner)
+    _check_scheduler(cfg, planner)
     jobs = plan_episodes(cfg, select_tasks(cfg), digest)
     folder = run_folder(cfg, digest)
     folder.mkdir(parents=True, exist_ok=True)
     metadata = _metadata(cfg, jobs, digest, cfg.planner.kind == "expert")
+    own = str(folder.absolute())
+    setup = WorkerSetup(planner, cfg.difficulty, cfg.start, cfg.contingencies, None, cfg.backend, own, cfg.cost_cap_usd)
     path = folder / "ledger.jsonl"
     with Ledger(path) as ledger:
         write_text(folder / "run.json", json.dumps(metadata, indent=1) + "\n")  # not while another process runs what it says
-        scores = scored(read_ledger(path))
-        wanted = [_fields_key(job) for job in jobs]
-        missing = [job for job, key in zip(jobs, wanted, strict=True) if key not in scores]
-        if len(missing) < len(jobs):
-            logger.info("%d of %d episodes are already in %s", len(jobs) - len(missing), len(jobs), path)
-        own = str(folder.absolute())
-        setup = WorkerSetup(planner, cfg.difficulty, cfg.start, cfg.contingencies, None, cfg.backend, own, cfg.cost_cap_usd)
-        stopped = ""
-        # Long episodes first, so that the workers finish together.
-        order = sorted(missing, key=lambda job: -job.task.step_budget)
-        solved = sum(scores[key].outcome is Outcome.SUCCESS for key in wanted if key in scores)
-        title = f"{cfg.planner.name} {cfg.robot.name} {cfg.difficulty}"
-        with (
-            tqdm(total=len(jobs), initial=len(jobs) - len(missing), desc=title, unit="episode") as bar,
-            contextlib.closing(scheduled(cfg, setup, order, _to_repeat, opener)) as results,
-        ):
-            for result in results:
-                if result.stop:
-                    stopped = result.stop
-                    break
-                ledger.append(result.record)
-                if not _broke(result):
-                    solved += result.record.outcome is Outcome.SUCCESS
-                    bar.set_postfix_str(f"success {solved}/{bar.n + 1}", refresh=False)
-                    bar.update(1)
+        stopped = _run_missing(cfg, setup, jobs, ledger, path, opener)
     everything = read_ledger(path)
-    scores = scored(everything)
+    scores, wanted = scored(everything), [_fields_key(job) for job in jobs]
     keys = set(wanted)
     broken = [r for r in everything if r.outcome is Outcome.INFRASTRUCTURE_ERROR and key_of(r) in keys]
     return EvalRun(folder, metadata, tuple(scores[key] for key in wanted if key in scores), tuple(broken), stopped)
+
+
+def _check_scheduler(cfg: EvalConfig, planner: PlannerConfig) -> None:
+    """What the schedule needs; a missing extra stops here, before anything is written."""
+    if cfg.scheduler == "ray":
+        import_ray(cfg.ray_address)
+    if cfg.batch > 1 and planner.kind == "file":
+        batch_planner(planner)
+
+
+def _run_missing(
+    cfg: EvalConfig, setup: WorkerSetup, jobs: Sequence[EpisodeJob], ledger: Ledger, path: Path, opener: Opener | None
+) -> str:
+    """Runs what the ledger does not have, the longest episodes first, so that workers finish together; why it stopped."""
+    scores = scored(read_ledger(path))
+    known = [scores[key] for key in map(_fields_key, jobs) if key in scores]
+    missing = [job for job in jobs if _fields_key(job) not in scores]
+    if known:
+        logger.info("%d of %d episodes are already in %s", len(known), len(jobs), path)
+    order = sorted(missing, key=lambda job: -job.task.step_budget)
+    solved = sum(record.outcome is Outcome.SUCCESS for record in known)
+    title = f"{cfg.planner.name} {cfg.robot.name} {cfg.difficulty}"
+    with (
+        tqdm(total=len(jobs), initial=len(known), desc=title, unit="episode") as bar,
+        contextlib.closing(scheduled(cfg, setup, order, _to_repeat, opener)) as results,
+    ):
+        for result in results:
+            if result.stop:
+                return result.stop
+            ledger.append(result.record)
+            if not _broke(result):
+                solved += result.record.outcome is Outcome.SUCCESS
+                bar.set_postfix_str(f"success {solved}/{bar.n + 1}", refresh=False)
+                bar.update(1)
+    return ""
 
 
 def _to_repeat(result: EpisodeResult) -> bool:

@@ -1,17 +1,18 @@
-"""Who runs the episodes of an evaluation: this process, a process pool, or Ray; and where the model lives.
+"""Who runs the episodes of an evaluation: this process, a process pool, or Ray; with batched calls of the model or without.
 
 Paper: none (engineering).
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Generator, Sequence
 
 from configs.schema.eval import EvalConfig
 from data.cluster import ray_instance
-from proprio_mllm.evaluation.pool import run_jobs, run_side_by_side
+from proprio_mllm.evaluation.pool import run_here, run_jobs
 from proprio_mllm.evaluation.ray_pool import ray_model, run_ray_jobs
 from proprio_mllm.evaluation.serving import model_process
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWorker, Opener, WorkerSetup, lost_episode
@@ -41,20 +42,18 @@ def scheduled(
 
     if not jobs:
         return
+    retried = (failed, lost_episode, cfg.retries)
     if cfg.scheduler == "ray":
         with ray_instance(cfg.workers, cfg.ray_address) as ray:
-            if cfg.batch > 1:
-                setup = dataclasses.replace(setup, server=ray_model(ray, setup.planner, cfg.batch))
-            yield from run_ray_jobs(ray, make(setup), jobs, cfg.workers, failed, lost_episode, cfg.retries)
-    elif cfg.threads > 1:
-        yield from run_side_by_side(make(setup)().in_threads, jobs, cfg.threads, failed, lambda job: job.fields, cfg.retries)
-    elif cfg.batch == 1:
-        yield from run_jobs(make(setup), jobs, cfg.workers, failed, lost_episode, cfg.retries)
-    elif cfg.workers == 0:
-        yield from run_side_by_side(make(setup)().side_by_side, jobs, cfg.batch, failed, lambda job: job.fields, cfg.retries)
+            server = ray_model(ray, setup.planner, cfg.batch) if cfg.batch > 1 else None
+            yield from run_ray_jobs(ray, make(dataclasses.replace(setup, server=server)), jobs, cfg.workers, *retried)
+    elif cfg.workers == 0 or cfg.threads > 1:
+        count = max(cfg.batch, cfg.threads)
+        yield from run_here(make(setup)().run, jobs, count, failed, lambda job: job.fields, cfg.retries)
     else:
-        with model_process(setup.planner, cfg.batch) as model:
-            own = make(dataclasses.replace(setup, server=model.server))
-            for result in run_jobs(own, jobs, cfg.workers, failed, lost_episode, cfg.retries):
-                model.ensure()
+        with model_process(setup.planner, cfg.batch) if cfg.batch > 1 else contextlib.nullcontext() as model:
+            own = setup if model is None else dataclasses.replace(setup, server=model.server)
+            for result in run_jobs(make(own), jobs, cfg.workers, *retried):
+                if model is not None:
+                    model.ensure()
                 yield result

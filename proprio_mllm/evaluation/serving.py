@@ -1,6 +1,6 @@
 """One process that holds the model, for all worker processes of this machine.
 
-Workers connect through a Unix socket with a random key; each connection is a caller of the `Batcher`, which answers up to
+Workers connect through a Unix socket with a random key; each connection is a caller of the `ModelDesk`, which answers up to
 `batch` of them at once. When the process dies, the calls under way become infrastructure errors, it is started anew, and the
 workers connect again at their next episode.
 
@@ -30,7 +30,7 @@ import numpy as np
 from configs.schema.eval import PlannerConfig
 from data.interface.observation import Observation
 from data.workers import start_worker
-from proprio_mllm.evaluation.batching import AskingPlanner, Batcher, batch_planner
+from proprio_mllm.evaluation.asking import AskingPlanner, ModelDesk, batch_planner
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
 
 __all__ = ["ModelProcess", "SocketServer", "model_process"]
@@ -51,7 +51,7 @@ class _Connected:
         self._connection: Connection[Any, Any] | None = None
 
     def ask(self, method: str, *arguments: Any) -> Any:
-        """Calls a method of the batcher.
+        """Calls a method of the desk.
 
         Raises:
             RuntimeError: with the error's text, when the call failed there.
@@ -103,7 +103,7 @@ def _connected(server: SocketServer) -> Connection[Any, Any]:
 def _serve(planner: PlannerConfig, batch: int, server: SocketServer) -> None:
     start_worker()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # ends tidily, so that nothing of it is left to clean up
-    batcher = Batcher(batch_planner(planner), batch)
+    desk = ModelDesk(batch_planner(planner), batch)
     with contextlib.suppress(FileNotFoundError):
         os.unlink(server.path)  # of a process that died
     with Listener(server.path, "AF_UNIX", backlog=4096, authkey=server.key) as listener:
@@ -112,19 +112,19 @@ def _serve(planner: PlannerConfig, batch: int, server: SocketServer) -> None:
             with contextlib.suppress(OSError, EOFError):  # a caller that went away while it connected
                 connection = listener.accept()
                 number += 1
-                threading.Thread(target=_answer, args=(batcher, connection, str(number)), daemon=True).start()
+                threading.Thread(target=_answer, args=(desk, connection, str(number)), daemon=True).start()
 
 
-def _answer(batcher: Batcher, connection: Connection[Any, Any], caller: str) -> None:
+def _answer(desk: ModelDesk, connection: Connection[Any, Any], caller: str) -> None:
     """Answers one caller until it goes away."""
 
     def begin(task: TaskInfo, rng: np.random.Generator) -> None:
-        batcher.begin(caller, task, rng)
+        desk.begin(caller, task, rng)
 
     def step(observation: Observation) -> PlannerReply:
-        return batcher.step(caller, observation)
+        return desk.step(caller, observation)
 
-    methods = {"begin": begin, "step": step, "image_size": lambda: batcher.image_size}
+    methods = {"begin": begin, "step": step, "image_size": lambda: desk.image_size}
     with connection, contextlib.suppress(OSError, EOFError):
         while True:
             method, arguments = connection.recv()

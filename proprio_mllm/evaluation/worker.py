@@ -5,6 +5,7 @@ Everything in here is plain data or made inside the process, so that jobs and re
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 from collections import deque
@@ -19,7 +20,7 @@ from configs.schema.eval import DifficultyName, PlannerConfig, StartName
 from configs.schema.robot import RobotConfig
 from data.interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest, CostCapError, UnreachableError
-from proprio_mllm.evaluation.batching import answer_all
+from proprio_mllm.evaluation.asking import answer_all
 from proprio_mllm.evaluation.episode import (
     Ask,
     Begin,
@@ -27,7 +28,6 @@ from proprio_mllm.evaluation.episode import (
     EpisodeKeyFields,
     RunnableSession,
     episode_steps,
-    run_episode,
 )
 from proprio_mllm.planners.bars import without_bar
 from proprio_mllm.planners.protocol import BatchPlanner, Planner, PlannerReply
@@ -125,7 +125,7 @@ def _open(setup: WorkerSetup, job: EpisodeJob, planner: Planner) -> RunnableSess
 
 
 class EpisodeWorker:
-    """Runs episodes one after the other.
+    """Runs episodes in this process.
 
     Args:
         setup: what they share.
@@ -141,17 +141,14 @@ class EpisodeWorker:
 
     def __call__(self, job: EpisodeJob) -> EpisodeResult:
         """Runs one episode."""
-        recorder, opened = _recorder() if job.record else None, list[RunnableSession]()
-        task, watch = job.task, None if recorder is None else recorder.watch
-        opening = self._opening(job, opened)
-        record = run_episode(opening, self.planner, job.fields, task.instruction, task.step_budget, job.luck, watch)
-        return self._finished(_result(job, record, recorder, opened))
+        ((_, result),) = self.run(deque([job]), 1)
+        return result
 
-    def in_threads(self, queue: deque[EpisodeJob], count: int) -> Iterator[tuple[EpisodeJob, EpisodeResult]]:
-        """Runs the episodes of a queue, up to `count` at a time, each with a planner of its own that answers in a thread.
+    def run(self, queue: deque[EpisodeJob], count: int) -> Iterator[tuple[EpisodeJob, EpisodeResult]]:
+        """Runs the episodes of a queue in this thread, up to `count` at a time.
 
-        The simulator stays in this thread and works for whichever episode has its answer; a model that is slow to answer keeps
-        the others going.
+        The simulator's part of the episodes takes turns. A planner that answers several episodes is asked for all of them at
+        once; one that asks a backend answers each in a thread of its own, so that a slow model keeps no other episode waiting.
 
         Args:
             queue: is emptied; what is appended meanwhile is run too.
@@ -161,85 +158,46 @@ class EpisodeWorker:
             Each job with its result, in the order they end.
 
         Raises:
-            ValueError: when the planner asks no backend.
+            ValueError: when several at a time are asked of a planner that answers one.
         """
-        if self._chats is None:
-            raise ValueError(f"planner {self.setup.planner.name!r} asks no backend; threads are for planners that do")
-        planners = [self._chats.planner() for _ in range(count)]
         running: dict[int, _Running] = {}
-        asked: dict[Future[PlannerReply | Exception | None], int] = {}
-        with ThreadPoolExecutor(count) as pool:
+        with contextlib.closing(self._asker(count)) as asker:
             while queue or running:
                 for slot in range(count):
                     if queue and slot not in running:
                         running[slot] = self._started(dataclasses.replace(queue.popleft(), slot=slot))
-                for slot in sorted(set(running) - set(asked.values())):
-                    one = running[slot]
-                    if one.record is None:
-                        assert one.request is not None
-                        asked[pool.submit(_answer, planners[slot], one.request)] = slot
+                asker.ask(running)
                 for slot in [slot for slot, one in running.items() if one.record is not None]:
                     one = running.pop(slot)
                     assert one.record is not None
                     yield one.job, self._finished(_result(one.job, one.record, one.recorder, one.opened))
-                if asked:
-                    for future in wait(asked, return_when=FIRST_COMPLETED).done:
-                        running[asked.pop(future)].go_on(future.result())
+
+    def _asker(self, count: int) -> _Asker:
+        """How the planner is asked."""
+        if self._chats is not None and count > 1:
+            return _Threads([self._chats.planner() for _ in range(count)])
+        if count == 1:
+            return _Alone(self.planner)
+        if not isinstance(self.planner, BatchPlanner):
+            raise ValueError(
+                f"planner {self.setup.planner.name!r} answers one episode at a time: it has no begin and step_batch"
+            )
+        return _Together(self.planner)
 
     def _finished(self, result: EpisodeResult) -> EpisodeResult:
         """The result, with what keeps the run from going on."""
         stop = "" if self._chats is None else self._chats.stop
         return dataclasses.replace(result, stop=stop) if stop and _broken(result) else result
 
-    def side_by_side(self, queue: deque[EpisodeJob], count: int) -> Iterator[tuple[EpisodeJob, EpisodeResult]]:
-        """Runs the episodes of a queue in this thread, up to `count` at a time, and asks the planner for all of them at once.
+    def _started(self, job: EpisodeJob) -> _Running:
+        recorder, opened = _recorder() if job.record else None, list[RunnableSession]()
+        task, watch = job.task, None if recorder is None else recorder.watch
 
-        The simulator's part of the episodes takes turns; the order of everything is fixed by the queue.
-
-        Args:
-            queue: is emptied; what is appended meanwhile is run too.
-            count: episodes at a time.
-
-        Yields:
-            Each job with its result, in the order they end.
-
-        Raises:
-            ValueError: when the planner answers one episode at a time only.
-        """
-        planner = self.planner
-        if not isinstance(planner, BatchPlanner):
-            raise ValueError(
-                f"planner {self.setup.planner.name!r} answers one episode at a time: it has no begin and step_batch"
-            )
-        running: dict[int, _Running] = {}
-        while queue or running:
-            for slot in range(count):
-                if queue and slot not in running:
-                    running[slot] = self._started(dataclasses.replace(queue.popleft(), slot=slot))
-            for one in running.values():
-                if isinstance(one.request, Begin):
-                    one.begin(planner)
-            asked = [one for one in running.values() if isinstance(one.request, Ask)]
-            seen = [one.request.observation for one in asked if isinstance(one.request, Ask)]
-            answers = answer_all(planner, seen, [one.state for one in asked])
-            for one, answer in zip(asked, answers, strict=True):
-                one.go_on(answer)
-            for slot in [slot for slot, one in running.items() if one.record is not None]:
-                one = running.pop(slot)
-                assert one.record is not None
-                yield one.job, _result(one.job, one.record, one.recorder, one.opened)
-
-    def _opening(self, job: EpisodeJob, opened: list[RunnableSession]) -> Callable[[], RunnableSession]:
         def open_session() -> RunnableSession:
             opened.append(self._opener(self.setup, job, self.planner))
             return opened[-1]
 
-        return open_session
-
-    def _started(self, job: EpisodeJob) -> _Running:
-        recorder, opened = _recorder() if job.record else None, list[RunnableSession]()
-        task, watch = job.task, None if recorder is None else recorder.watch
-        episode = episode_steps(self._opening(job, opened), job.fields, task.instruction, task.step_budget, job.luck, watch)
+        episode = episode_steps(open_session, job.fields, task.instruction, task.step_budget, job.luck, watch)
         one = _Running(job, episode, recorder, opened)
         one.go_on(None)
         return one
@@ -247,7 +205,7 @@ class EpisodeWorker:
 
 @dataclass(slots=True)
 class _Running:
-    """One of the episodes that go side by side: what it asks now, or its record."""
+    """An episode under way: what it asks now, or its record."""
 
     job: EpisodeJob
     episode: Episode
@@ -273,6 +231,78 @@ class _Running:
             self.go_on(error)
         else:
             self.go_on(None)
+
+
+class _Asker(Protocol):
+    """Asks a planner what episodes want to know."""
+
+    def ask(self, running: Mapping[int, _Running]) -> None:
+        """Answers episodes, by slot, that have a question: at least one, unless another one has ended."""
+        ...
+
+    def close(self) -> None:
+        """Waits for what is under way."""
+        ...
+
+
+class _Alone:
+    """One episode, one planner."""
+
+    def __init__(self, planner: Planner) -> None:
+        self._planner = planner
+
+    def ask(self, running: Mapping[int, _Running]) -> None:
+        """Answers it."""
+        for one in running.values():
+            if one.request is not None:
+                one.go_on(_answer(self._planner, one.request))
+
+    def close(self) -> None:
+        """Holds nothing."""
+
+
+class _Together:
+    """A planner that answers all at once; the order of everything is fixed by the queue."""
+
+    def __init__(self, planner: BatchPlanner) -> None:
+        self._planner = planner
+
+    def ask(self, running: Mapping[int, _Running]) -> None:
+        """Answers all of them."""
+        for one in running.values():
+            if isinstance(one.request, Begin):
+                one.begin(self._planner)
+        asked = [one for one in running.values() if isinstance(one.request, Ask)]
+        seen = [one.request.observation for one in asked if isinstance(one.request, Ask)]
+        for one, answer in zip(asked, answer_all(self._planner, seen, [one.state for one in asked]), strict=True):
+            one.go_on(answer)
+
+    def close(self) -> None:
+        """Holds nothing."""
+
+
+class _Threads:
+    """A planner per slot, each answering in a thread; whoever is first goes on."""
+
+    def __init__(self, planners: Sequence[Planner]) -> None:
+        self._planners = planners
+        self._pool = ThreadPoolExecutor(len(planners))
+        self._asked: dict[Future[PlannerReply | Exception | None], int] = {}
+
+    def ask(self, running: Mapping[int, _Running]) -> None:
+        """Sends new questions off, and waits for an answer unless an episode has ended."""
+        for slot in sorted(set(running) - set(self._asked.values())):
+            request = running[slot].request
+            if request is not None:
+                self._asked[self._pool.submit(_answer, self._planners[slot], request)] = slot
+        if any(one.record is not None for one in running.values()):
+            return  # what has ended makes room before anybody is waited for
+        for future in wait(self._asked, return_when=FIRST_COMPLETED).done:
+            running[self._asked.pop(future)].go_on(future.result())
+
+    def close(self) -> None:
+        """Waits for the calls under way."""
+        self._pool.shutdown()
 
 
 class _Chats:

@@ -33,9 +33,6 @@ class Interval:
 def wilson(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
     """Wilson's score interval of a proportion.
 
-    With z the normal quantile and p = successes / n, the limits are
-    (p + z²/2n ± z sqrt(p (1 - p) / n + z²/4n²)) / (1 + z²/n).
-
     Raises:
         ValueError: when not 0 <= successes <= n with n > 0, or the confidence is outside (0, 1).
     """
@@ -43,15 +40,8 @@ def wilson(successes: int, n: int, confidence: float = 0.95) -> tuple[float, flo
         raise ValueError(f"expected 0 <= successes <= n and n > 0, got {successes} of {n}")
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence {confidence} outside (0, 1)")
-    z = float(stats.norm.ppf(0.5 + confidence / 2))
-    p = successes / n
-    centre = p + z * z / (2 * n)
-    half = z * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
-    scale = 1 + z * z / n
-    # At 0 and n the exact limits are 0 and 1; rounding must not step over them.
-    low = 0.0 if successes == 0 else (centre - half) / scale
-    high = 1.0 if successes == n else (centre + half) / scale
-    return low, high
+    interval = stats.binomtest(successes, n).proportion_ci(confidence, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def cluster_bootstrap(

@@ -122,7 +122,7 @@ def test_threads_share_batches(folder: Path, open_chat: Open, ask: Ask, view: Lo
         first = pool.submit(chat.complete, requests[0])
         assert entered.wait(30)
         others = [pool.submit(chat.complete, request) for request in requests[1:]]
-        while len(chat._gathering._waiting) < 5:
+        while len(chat._batcher._waiting) < 5:
             threading.Event().wait(0.01)
         go.set()
         assert [told(one.result(60)) for one in (first, *others)] == expected

@@ -149,5 +149,6 @@ def test_wrong_slots(tmp_path: Path) -> None:
         Slots(1, tmp_path / "file" / "slots")
     slots = Slots(1, tmp_path / "gone")
     (tmp_path / "gone").rmdir()
+    (tmp_path / "gone").write_text("")
     with pytest.raises(BackendSetupError, match=r"slots at .*gone cannot be used"):
         SlottedBackend(Answering(), slots).complete(ask())

@@ -95,7 +95,7 @@ def test_a_planner_is_a_file(tmp_path: Path) -> None:
     planner.write_text((ROOT / "examples" / "own_planner.py").read_text(encoding="utf-8"), encoding="utf-8")
     code = (
         "import sys, eval\n"
-        "words = ['planner=file', 'planner.source=' + sys.argv[2] + ':Nearby', 'limit=1', 'workers=1', 'output=' + sys.argv[1]]\n"
+        "words = ['planner=file', 'planner.source=' + sys.argv[2] + ':Nearby', 'limit=1', 'output=' + sys.argv[1]]\n"
         "assert eval.main(words) == 0\n"
         "print('works')\n"
     )

@@ -4,7 +4,9 @@ Whenever the answerer is free it takes what waits, oldest first, up to a limit, 
 thread of its own: the thread whose call has waited longest answers the batch that its call is in, so an unexpected error is
 raised where somebody sees it, and the other calls of that batch are then asked one by one.
 
-Paper: none (engineering).
+The one batcher of this project: an in-process checkpoint gathers its requests in one, and a model's process the observations of
+many episodes (`proprio_mllm.evaluation.asking`). Which calls meet in a batch depends on timing; a row's answer does not depend
+on the rows beside it, up to the rounding of sums. Paper: none (engineering).
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from typing import Generic, TypeVar
 
 from proprio_mllm.backends.protocol import BackendError
 
-__all__ = ["Gathering"]
+__all__ = ["Batcher"]
 
 Q = TypeVar("Q")
 A = TypeVar("A")
@@ -29,11 +31,11 @@ class _Call(Generic[Q, A]):
 
     def __init__(self, question: Q) -> None:
         self.question = question
-        self.answer: A | BackendError | None = None
+        self.answer: A | Exception | None = None
         self.alone = False
 
 
-class Gathering(Generic[Q, A]):
+class Batcher(Generic[Q, A]):
     """Hands the questions of many threads to one function, several at a time and never two batches at once.
 
     Args:
@@ -44,7 +46,7 @@ class Gathering(Generic[Q, A]):
         ValueError: when the limit is not positive.
     """
 
-    def __init__(self, answer: Callable[[Sequence[Q]], Sequence[A | BackendError]], limit: int) -> None:
+    def __init__(self, answer: Callable[[Sequence[Q]], Sequence[A | Exception]], limit: int) -> None:
         if limit < 1:
             raise ValueError(f"limit {limit} must be positive")
         self._answer = answer
@@ -59,7 +61,7 @@ class Gathering(Generic[Q, A]):
         """The answer to a question; blocks until it is there.
 
         Raises:
-            BackendError: the one given in place of an answer, or when the gathering is closed.
+            Exception: the one given in place of an answer; a BackendError when the batcher is closed.
         """
         call: _Call[Q, A] = _Call(question)
         with self._changed:
@@ -72,7 +74,7 @@ class Gathering(Generic[Q, A]):
                 if call in self._waiting:
                     self._waiting.remove(call)
                 self._changed.notify_all()
-        if isinstance(call.answer, BackendError):
+        if isinstance(call.answer, Exception):
             raise call.answer
         assert call.answer is not None
         return call.answer
@@ -102,7 +104,7 @@ class Gathering(Generic[Q, A]):
 
     def _serve(self, batch: list[_Call[Q, A]]) -> None:
         """Answers a batch; on an error nobody foresaw, which is raised, all but the first wait again, each alone."""
-        answers: Sequence[A | BackendError] = ()
+        answers: Sequence[A | Exception] = ()
         try:
             answers = self._answer([call.question for call in batch])
             if len(answers) != len(batch):

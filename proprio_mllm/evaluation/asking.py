@@ -1,18 +1,12 @@
-"""Planner calls of several episodes answered together.
+"""How episodes ask a planner that answers several at once: all of a known set, or at a desk in another process.
 
-`answer_all` asks once for a known set of episodes. A `Batcher` collects the calls of many threads: whenever the model is free
-it takes what is waiting, up to a limit, so nobody waits for a batch to fill. Which calls meet there depends on timing; a row's
-answer does not depend on the other rows, up to the rounding of sums.
-
+`answer_all` asks once for a known set of episodes; a `ModelDesk` serves the calls of many threads with the project's batcher.
 Paper: none (engineering).
 """
 
 from __future__ import annotations
 
-import queue
-import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
@@ -20,10 +14,11 @@ import numpy as np
 from configs.schema.eval import PlannerConfig
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
+from proprio_mllm.backends.batching import Batcher
 from proprio_mllm.planners.protocol import BatchPlanner, PlannerReply, TaskInfo
 from proprio_mllm.planners.registry import make_planner
 
-__all__ = ["AskingPlanner", "Batcher", "answer_all", "batch_planner"]
+__all__ = ["AskingPlanner", "ModelDesk", "answer_all", "batch_planner"]
 
 
 def answer_all(
@@ -46,25 +41,32 @@ def answer_all(
     return replies
 
 
-class Batcher:
-    """Answers calls from many threads with one planner, in one thread of its own.
+class ModelDesk:
+    """One planner for the episodes of many callers, several of which are answered together.
 
     Args:
         planner: who answers.
         limit: most calls answered together.
+
+    Raises:
+        ValueError: when the limit is not positive.
     """
 
     def __init__(self, planner: BatchPlanner, limit: int) -> None:
-        if limit < 1:
-            raise ValueError(f"limit {limit} must be positive")
         self.image_size = planner.image_size
         self._planner = planner
-        self._limit = limit
         self._states: dict[str, Any] = {}
-        self._waiting: queue.SimpleQueue[tuple[Observation, Any, Future[PlannerReply]]] = queue.SimpleQueue()
-        #: Calls answered, and batches they came in.
-        self.calls = self.batches = 0
-        threading.Thread(target=self._serve, daemon=True).start()
+        self._batcher: Batcher[tuple[Observation, Any], PlannerReply] = Batcher(self._answer, limit)
+
+    @property
+    def calls(self) -> int:
+        """Calls answered so far."""
+        return self._batcher.questions
+
+    @property
+    def batches(self) -> int:
+        """Batches that they came in."""
+        return self._batcher.batches
 
     def begin(self, caller: str, task: TaskInfo, rng: np.random.Generator) -> None:
         """Starts an episode of a caller; its last one is forgotten."""
@@ -78,30 +80,18 @@ class Batcher:
         """
         if caller not in self._states:
             raise KeyError(f"caller {caller!r} has begun no episode here")
-        future: Future[PlannerReply] = Future()
-        self._waiting.put((observation, self._states[caller], future))
-        return future.result()
+        return self._batcher.ask((observation, self._states[caller]))
 
-    def _serve(self) -> None:
-        while True:
-            taken = [self._waiting.get()]
-            while len(taken) < self._limit and not self._waiting.empty():
-                taken.append(self._waiting.get())
-            self.calls, self.batches = self.calls + len(taken), self.batches + 1
-            answers = answer_all(self._planner, [one for one, _, _ in taken], [state for _, state, _ in taken])
-            for (_, _, future), answer in zip(taken, answers, strict=True):
-                if isinstance(answer, Exception):
-                    future.set_exception(answer)
-                else:
-                    future.set_result(answer)
+    def _answer(self, asked: Sequence[tuple[Observation, Any]]) -> list[PlannerReply | Exception]:
+        return answer_all(self._planner, [observation for observation, _ in asked], [state for _, state in asked])
 
 
 class AskingPlanner:
-    """A planner that hands its calls to a `Batcher` in another process.
+    """A planner that hands its calls to a `ModelDesk` in another process.
 
     Args:
         image_size: side of the image that the planner there wants to see.
-        ask: calls a method of the batcher, `begin` or `step`, with its arguments but the caller.
+        ask: calls a method of the desk, `begin` or `step`, with its arguments but the caller.
     """
 
     privileged = False

@@ -13,8 +13,8 @@ from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
 from data.interface.episode import EpisodeRecord, Outcome
 from data.interface.observation import Observation
-from proprio_mllm.evaluation.batching import AskingPlanner, Batcher, answer_all, batch_planner
-from proprio_mllm.evaluation.pool import run_side_by_side
+from proprio_mllm.evaluation.asking import AskingPlanner, ModelDesk, answer_all, batch_planner
+from proprio_mllm.evaluation.pool import run_here
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.planners.protocol import BatchPlanner, Planner, TaskInfo, parse_reply
 from sim.tasks.task import write_tasks
@@ -110,12 +110,12 @@ def test_broken_sessions_are_tried_again_side_by_side(cfg, session, tmp_path) ->
 
 def test_jobs_are_refilled_and_retried_in_order() -> None:
     class Echo:
-        def side_by_side(self, queue: deque[int], count: int):
+        def run(self, queue: deque[int], count: int):
             while queue:
                 job = queue.popleft()
                 yield job, job
 
-    results = run_side_by_side(Echo().side_by_side, [1, 2, 3], 2, lambda result: result == 2, lambda job: job, retries=2)
+    results = run_here(Echo().run, [1, 2, 3], 2, lambda result: result == 2, lambda job: job, retries=2)
     assert list(results) == [1, 2, 3, 2, 2]
 
 
@@ -155,15 +155,15 @@ class Slow:
         return [parse_reply(f"MoveAhead({1 + state / 1000})") for state in states]
 
 
-def test_a_batcher_takes_what_waits_and_answers_each_caller(session) -> None:
+def test_a_desk_takes_what_waits_and_answers_each_caller(session) -> None:
     planner = Slow()
     assert isinstance(planner, BatchPlanner)
-    batcher = Batcher(planner, limit=4)
+    desk = ModelDesk(planner, limit=4)
     seen: Observation = session().reset(0)
     answers: dict[str, str] = {}
 
     def call(name: str) -> None:
-        asking = AskingPlanner(batcher.image_size, lambda method, *given: getattr(batcher, method)(name, *given))
+        asking = AskingPlanner(desk.image_size, lambda method, *given: getattr(desk, method)(name, *given))
         assert isinstance(asking, Planner)
         asking.reset(TaskInfo("x", "h1", 1), np.random.default_rng(int(name)))
         answers[name] = asking.step(seen, None).text
@@ -174,19 +174,19 @@ def test_a_batcher_takes_what_waits_and_answers_each_caller(session) -> None:
         threads[0].join(0.001)
     for thread in threads[1:]:
         thread.start()
-    while batcher._waiting.qsize() < 6:
+    while len(desk._batcher._waiting) < 6:
         threads[0].join(0.001)
     planner.go.set()
     for thread in threads:
         thread.join(10)
     assert planner.sizes == [1, 4, 2]
-    assert (batcher.calls, batcher.batches) == (7, 3)
+    assert (desk.calls, desk.batches) == (7, 3)
     expected = {str(n): f"MoveAhead({1 + int(np.random.default_rng(n).integers(1000)) / 1000})" for n in range(7)}
     assert answers == expected
     with pytest.raises(KeyError, match="caller 'nobody' has begun no episode"):
-        batcher.step("nobody", seen)
+        desk.step("nobody", seen)
     with pytest.raises(ValueError, match="limit 0"):
-        Batcher(planner, 0)
+        ModelDesk(planner, 0)
 
 
 def test_answers_must_be_as_many_as_questions(session) -> None:

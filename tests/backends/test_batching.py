@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import pytest
 
-from proprio_mllm.backends.gathering import Gathering
+from proprio_mllm.backends.batching import Batcher
 from proprio_mllm.backends.protocol import BackendError
 
 
@@ -21,7 +21,7 @@ class Doubler:
         self.entered, self.go = threading.Event(), threading.Event()
         self.poison: int | None = None
 
-    def __call__(self, numbers: Sequence[int]) -> list[int | BackendError]:
+    def __call__(self, numbers: Sequence[int]) -> list[int | Exception]:
         self.batches.append(list(numbers))
         if len(self.batches) == 1:
             self.entered.set()
@@ -38,34 +38,32 @@ def until(condition: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
-def held(
-    pool: ThreadPoolExecutor, gathering: Gathering[int, int], doubler: Doubler, numbers: Sequence[int]
-) -> list[Future[int]]:
+def held(pool: ThreadPoolExecutor, batcher: Batcher[int, int], doubler: Doubler, numbers: Sequence[int]) -> list[Future[int]]:
     """Asks for each number in order; the first is under way and the others wait, until `go`."""
-    asked = [pool.submit(gathering.ask, numbers[0])]
+    asked = [pool.submit(batcher.ask, numbers[0])]
     assert doubler.entered.wait(30)
     for count, number in enumerate(numbers[1:], 1):
-        asked.append(pool.submit(gathering.ask, number))
-        until(lambda count=count: len(gathering._waiting) == count)
+        asked.append(pool.submit(batcher.ask, number))
+        until(lambda count=count: len(batcher._waiting) == count)
     return asked
 
 
 def test_who_waits_is_answered_together_oldest_first() -> None:
     doubler = Doubler()
-    gathering: Gathering[int, int] = Gathering(doubler, 3)
+    batcher: Batcher[int, int] = Batcher(doubler, 3)
     with ThreadPoolExecutor(8) as pool:
-        asked = held(pool, gathering, doubler, range(8))
+        asked = held(pool, batcher, doubler, range(8))
         doubler.go.set()
         assert [one.result(30) for one in asked] == [2 * n for n in range(8)]
     assert doubler.batches == [[0], [1, 2, 3], [4, 5, 6], [7]]
-    assert (gathering.questions, gathering.batches) == (8, 4)
+    assert (batcher.questions, batcher.batches) == (8, 4)
 
 
 def test_an_error_in_place_of_an_answer_is_its_callers() -> None:
     doubler = Doubler()
-    gathering: Gathering[int, int] = Gathering(doubler, 8)
+    batcher: Batcher[int, int] = Batcher(doubler, 8)
     with ThreadPoolExecutor(4) as pool:
-        asked = held(pool, gathering, doubler, (1, 2, -3, 4))
+        asked = held(pool, batcher, doubler, (1, 2, -3, 4))
         doubler.go.set()
         with pytest.raises(BackendError, match="-3 is negative"):
             asked[2].result(30)
@@ -76,9 +74,9 @@ def test_an_error_that_nobody_foresaw_reaches_who_caused_it() -> None:
     """The first of a broken batch is told, rightly or not; the others are asked one by one."""
     doubler = Doubler()
     doubler.poison = 3
-    gathering: Gathering[int, int] = Gathering(doubler, 3)
+    batcher: Batcher[int, int] = Batcher(doubler, 3)
     with ThreadPoolExecutor(6) as pool:
-        asked = held(pool, gathering, doubler, (1, 3, 4, 5, 6))
+        asked = held(pool, batcher, doubler, (1, 3, 4, 5, 6))
         doubler.go.set()
         with pytest.raises(ZeroDivisionError, match="over 3"):
             asked[1].result(30)
@@ -87,18 +85,18 @@ def test_an_error_that_nobody_foresaw_reaches_who_caused_it() -> None:
 
 
 def test_a_wrong_number_of_answers_is_refused() -> None:
-    gathering: Gathering[int, int] = Gathering(lambda numbers: [], 3)
+    batcher: Batcher[int, int] = Batcher(lambda numbers: [], 3)
     with pytest.raises(ValueError, match="0 answers to 1 questions"):
-        gathering.ask(1)
+        batcher.ask(1)
 
 
 def test_closing_waits_for_the_batch_under_way() -> None:
     doubler = Doubler()
-    gathering: Gathering[int, int] = Gathering(doubler, 1)
+    batcher: Batcher[int, int] = Batcher(doubler, 1)
     with ThreadPoolExecutor(4) as pool:
-        asked = held(pool, gathering, doubler, (1, 2, 3))
-        closing = pool.submit(gathering.close)
-        until(lambda: gathering._closed)
+        asked = held(pool, batcher, doubler, (1, 2, 3))
+        closing = pool.submit(batcher.close)
+        until(lambda: batcher._closed)
         assert not closing.done()
         doubler.go.set()
         closing.result(30)
@@ -107,19 +105,19 @@ def test_closing_waits_for_the_batch_under_way() -> None:
             with pytest.raises(BackendError, match="closed"):
                 one.result(30)
     with pytest.raises(BackendError, match="closed"):
-        gathering.ask(4)
+        batcher.ask(4)
 
 
 def test_many_threads_get_their_own_answers() -> None:
     doubler = Doubler()
     doubler.go.set()
-    gathering: Gathering[int, int] = Gathering(doubler, 4)
+    batcher: Batcher[int, int] = Batcher(doubler, 4)
     with ThreadPoolExecutor(16) as pool:
-        assert list(pool.map(gathering.ask, range(400))) == [2 * n for n in range(400)]
+        assert list(pool.map(batcher.ask, range(400))) == [2 * n for n in range(400)]
     assert sorted(n for batch in doubler.batches for n in batch) == list(range(400))
     assert max(map(len, doubler.batches)) <= 4
 
 
 def test_the_limit_is_positive() -> None:
     with pytest.raises(ValueError, match="limit 0 must be positive"):
-        Gathering(lambda numbers: [], 0)
+        Batcher(lambda numbers: [], 0)
