@@ -157,15 +157,15 @@ def _scripted(cell: Cell, task: Task, plan: Sequence[str], rng: np.random.Genera
 def run_scripted(episode: Scripted, task: Task) -> ScriptedResult:
     """Acts an episode out with the harness's own runner, at difficulty easy."""
     planner = FaultyPlanner(task, episode.cause, episode.gives_up, episode.slip, episode.late, episode.after)
-    luck = episode_seed(episode.seed, task.id, episode.robot, 0)
+    own_seed = episode_seed(episode.seed, task.id, episode.robot, 0)
     fields = EpisodeKeyFields("scripted", episode.robot, task.id, task.category, "easy", 0, episode.seed, episode.cause)
     opened: list[RunnableSession] = []
 
     def open_one() -> RunnableSession:
-        opened.append(open_session(RobotConfig(episode.robot), "easy", "fixed", task, luck, planner))
+        opened.append(open_session(RobotConfig(episode.robot), "easy", "fixed", task, own_seed, planner))
         return opened[-1]
 
-    record = run_episode(open_one, planner, fields, task.instruction, task.step_budget, luck)
+    record = run_episode(open_one, planner, fields, task.instruction, task.step_budget, own_seed)
     broken = record.outcome is Outcome.INFRASTRUCTURE_ERROR
     unmet = () if broken else tuple(sorted(opened[-1].goals().unmet_objects))
     return ScriptedResult(episode, record, planner.exercised, planner.slipped, unmet)

@@ -117,7 +117,7 @@ def overhead(tasks: Path, folder: Path) -> dict[str, float]:
     spent: list[float] = []
 
     def opener(setup: WorkerSetup, job: EpisodeJob, planner: Planner) -> RunnableSession:
-        opened = open_session(job.robot, setup.difficulty, setup.start, job.task, job.luck, planner)
+        opened = open_session(job.robot, setup.difficulty, setup.start, job.task, job.episode_seed, planner)
         return Timed(opened, spent)
 
     cfg = config(tasks, folder / "warm", 0)

@@ -136,7 +136,7 @@ def run_episode(
     fields: EpisodeKeyFields,
     instruction: str,
     step_budget: int,
-    luck: int,
+    episode_seed: int,
     watch: Watcher | None = None,
 ) -> EpisodeRecord:
     """Runs an episode to its end with a planner of its own; see `episode_steps` for the arguments.
@@ -144,7 +144,7 @@ def run_episode(
     Returns:
         The record; on any exception one with the outcome `INFRASTRUCTURE_ERROR` and the error's text.
     """
-    episode = episode_steps(open_session, fields, instruction, step_budget, luck, watch)
+    episode = episode_steps(open_session, fields, instruction, step_budget, episode_seed, watch)
     try:
         request = next(episode)
         while True:
@@ -167,7 +167,7 @@ def episode_steps(
     fields: EpisodeKeyFields,
     instruction: str,
     step_budget: int,
-    luck: int,
+    episode_seed: int,
     watch: Watcher | None = None,
 ) -> Episode:
     """An episode that pauses wherever it needs its planner, so that several can go side by side in one thread.
@@ -177,7 +177,7 @@ def episode_steps(
         fields: the episode's key.
         instruction: the task's instruction.
         step_budget: steps allowed, without those that a contingency spoils: they are acted out and recorded, not charged.
-        luck: the episode's seed (`seeds.episode_seed`), for the session and the planner's random stream.
+        episode_seed: the episode's seed (`seeds.episode_seed`), for the session and the planner's random stream.
         watch: sees every observation.
 
     Yields:
@@ -190,8 +190,8 @@ def episode_steps(
     tally = _Tally()
     try:
         session = open_session()
-        observation = session.reset(luck)
-        yield Begin(TaskInfo(instruction, fields.robot, step_budget), stream(luck, "planner"))
+        observation = session.reset(episode_seed)
+        yield Begin(TaskInfo(instruction, fields.robot, step_budget), stream(episode_seed, "planner"))
         done = yield from _loop(session, observation, step_budget, tally, watch)
         goals, stats = session.goals(), session.stats()
     except Exception as error:  # noqa: BLE001  # an episode must never end the run; the record tells what happened

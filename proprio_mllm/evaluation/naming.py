@@ -30,12 +30,12 @@ def options_of(config: Mapping[str, Any]) -> list[str]:
     planner = config.get("planner", {})
     category, split, start = (config.get(name, "all") for name in ("category", "split", "start"))
     trials, limit, seed = config.get("trials", 1), config.get("limit"), config.get("seed", 0)
-    tasks, luck = config.get("tasks", "benchmark"), config.get("contingencies", "default")
+    tasks, contingencies = config.get("tasks", "benchmark"), config.get("contingencies", "default")
     said = (
         (category, category != "all"),
         (f"trials{trials}", trials != 1),
         (f"limit{limit}", limit is not None),
-        (luck, luck != "default"),
+        (contingencies, contingencies != "default"),
         (start, start not in ("all", "fixed")),
         (split, split != "all"),
         ("no_reflection", planner.get("reflection", "on") == "off"),

@@ -120,8 +120,8 @@ def _jobs(
         robot, task, trial = robots[number % len(robots)], tasks[number % len(tasks)], number // len(tasks)
         key = request.config_hash
         fields = EpisodeKeyFields("actor", robot, task.id, task.category, difficulty, trial, request.seed, key)
-        luck = episode_seed(request.seed, task.id, robot, trial)
-        jobs.append(EpisodeJob(fields, RobotConfig(robot), task, luck, record=True))
+        own_seed = episode_seed(request.seed, task.id, robot, trial)
+        jobs.append(EpisodeJob(fields, RobotConfig(robot), task, own_seed, record=True))
     return jobs
 
 

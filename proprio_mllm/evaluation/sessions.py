@@ -77,7 +77,7 @@ def open_session(
     difficulty: DifficultyName,
     start: StartName,
     task: Task,
-    luck: int,
+    episode_seed: int,
     planner: Planner,
     *,
     contingency: str = "default",
@@ -90,7 +90,7 @@ def open_session(
         difficulty: success of low-level skills.
         start: see `proprio_mllm.evaluation.starts`.
         task: the benchmark's task.
-        luck: the episode's seed.
+        episode_seed: the episode's seed.
         planner: who plans.
         contingency: outcome distributions.
         slot: which of the episodes that go side by side in this process; each has a session of its own.
@@ -104,7 +104,7 @@ def open_session(
 
         assert isinstance(planner, PrivilegedPlanner)
         planner.attach(session)
-    return SimSession(session, started(task, start, luck, _described(robot)))
+    return SimSession(session, started(task, start, episode_seed, _described(robot)))
 
 
 def _described(robot: RobotConfig) -> str:

@@ -28,14 +28,14 @@ _YAW_STEP_DEG: Final = 5.0
 _HEIGHT_STEP_M: Final = 0.05
 
 
-def started(task: Task, start: StartName, luck: int, robot: str | None = None) -> Task:
+def started(task: Task, start: StartName, episode_seed: int, robot: str | None = None) -> Task:
     """The task with the start of an episode.
 
     Args:
         task: as the benchmark has it.
         start: `fixed` leaves it; `turned` draws the heading, in steps of 5 degrees; `random` draws position, heading and pelvis
             height.
-        luck: the episode's seed.
+        episode_seed: the episode's seed.
         robot: name or description file of the robot that acts; needed for `random`.
 
     Raises:
@@ -43,7 +43,7 @@ def started(task: Task, start: StartName, luck: int, robot: str | None = None) -
     """
     if start == "fixed":
         return task
-    rng = stream(luck, "start")
+    rng = stream(episode_seed, "start")
     if start == "turned":
         yaw_deg = _YAW_STEP_DEG * float(rng.integers(72))
         return dataclasses.replace(task, start=dataclasses.replace(task.start, yaw_deg=yaw_deg))

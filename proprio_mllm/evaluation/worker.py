@@ -84,7 +84,7 @@ class EpisodeJob:
         fields: its key.
         robot: which robot acts.
         task: its task.
-        luck: its seed.
+        episode_seed: its seed.
         record: whether observations are kept for training.
         slot: which of the episodes that go side by side in its process.
     """
@@ -92,7 +92,7 @@ class EpisodeJob:
     fields: EpisodeKeyFields
     robot: RobotConfig
     task: Task
-    luck: int
+    episode_seed: int
     record: bool = False
     slot: int = 0
 
@@ -120,7 +120,14 @@ def _open(setup: WorkerSetup, job: EpisodeJob, planner: Planner) -> RunnableSess
     from proprio_mllm.evaluation.sessions import open_session  # physics and rendering load only where they run
 
     return open_session(
-        job.robot, setup.difficulty, setup.start, job.task, job.luck, planner, contingency=setup.contingency, slot=job.slot
+        job.robot,
+        setup.difficulty,
+        setup.start,
+        job.task,
+        job.episode_seed,
+        planner,
+        contingency=setup.contingency,
+        slot=job.slot,
     )
 
 
@@ -197,7 +204,7 @@ class EpisodeWorker:
             opened.append(self._opener(self.setup, job, self.planner))
             return opened[-1]
 
-        episode = episode_steps(open_session, job.fields, task.instruction, task.step_budget, job.luck, watch)
+        episode = episode_steps(open_session, job.fields, task.instruction, task.step_budget, job.episode_seed, watch)
         one = _Running(job, episode, recorder, opened)
         one.go_on(None)
         return one

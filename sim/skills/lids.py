@@ -3,6 +3,9 @@
 A door's bar lies deep in the hand, and the hand turns with it. A lid's tab is small and is held by the fingertips; the lid
 turns about a level axis by more than a right angle, which no wrist follows. So the hand keeps its direction as well as it can,
 and the tab turns between the fingers. Paper: Open and Close of the DualTHOR action space.
+
+Constants were chosen by hand; with them the certificates of the 359 benchmark tasks were made on both robots, and
+`benchmarks/doors.py` shows what they give on every door, drawer and lid of the ten rooms.
 """
 
 from __future__ import annotations

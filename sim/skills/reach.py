@@ -2,6 +2,8 @@
 
 A wish that the arm cannot fulfil is told apart by trying other pelvis heights at the same stance: none helps, TooFar; a lower
 one does, BodyTooHigh; a higher one does, BodyTooLow; the present one should do but every motion collides, Obstructed.
+
+Constants were chosen by hand; with them the certificates of the 359 benchmark tasks were made on both robots.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ T = TypeVar("T")
 #: How well the fingers must agree with the wished directions (cosines) for a grasp to be tried.
 MIN_POINTING: Final = 0.75
 MIN_CLOSING: Final = 0.8
+#: Largest turn of a joint between two postures that are checked on the way.
 _PATH_STEP_RAD: Final = 0.1
 #: Penetration on the way that is no obstacle, and the most that is tried when there is no better way: an edge catches a hand.
 _GRAZE_M: Final = 0.002

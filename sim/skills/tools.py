@@ -3,6 +3,8 @@
 The tool is brought down on the object by the same checked motion that puts things down, must touch it (within 15 mm), and is
 drawn to and fro; only then the state changes. Every failure brings the arm back first. Paper: slicing, cleaning and using up
 are states of DualTHOR without an action.
+
+Constants were chosen by hand; with them the certificates of the 359 benchmark tasks were made on both robots.
 """
 
 from __future__ import annotations
@@ -30,8 +32,10 @@ __all__ = ["assess_clean", "assess_slice", "assess_use_up", "clean", "slice_obje
 
 Array = NDArray[np.float64]
 
+#: Length and number of the strokes to and fro.
 _STROKE_M: Final = 0.04
 _STROKES: Final = 2
+#: How far a tool that does not touch yet is brought down, and how often.
 _PRESS_M: Final = 0.012
 _PRESS_STEPS: Final = 3
 

@@ -91,13 +91,13 @@ def test_other_settings_are_other_episodes(cfg) -> None:
     tasks = select_tasks(cfg)
     jobs = plan_episodes(dataclasses.replace(cfg, trials=2), tasks, "w")
     assert len({(job.fields.task, job.fields.trial) for job in jobs}) == 8
-    assert len({job.luck for job in jobs}) == 8
+    assert len({job.episode_seed for job in jobs}) == 8
     assert plan_episodes(cfg, tasks, "w")[0].fields != plan_episodes(cfg, tasks, "v")[0].fields
     turned = dataclasses.replace(cfg, start="turned")
     assert run_folder(turned, "w") != run_folder(cfg, "w")
     # The planner is not part of the luck.
     other = dataclasses.replace(cfg, planner=dataclasses.replace(cfg.planner, name="other"))
-    assert plan_episodes(other, tasks, "w")[0].luck == plan_episodes(cfg, tasks, "w")[0].luck
+    assert plan_episodes(other, tasks, "w")[0].episode_seed == plan_episodes(cfg, tasks, "w")[0].episode_seed
 
 
 def test_selection_refuses_what_is_not_there(cfg) -> None:

@@ -29,7 +29,7 @@ def test_turned_start_changes_the_heading_only() -> None:
     assert turned == started(TASK, "turned", 3)
     assert (turned.start.x_m, turned.start.y_m) == (TASK.start.x_m, TASK.start.y_m)
     assert turned.start.yaw_deg % 5 == 0
-    assert len({started(TASK, "turned", luck).start.yaw_deg for luck in range(12)}) > 4
+    assert len({started(TASK, "turned", episode_seed).start.yaw_deg for episode_seed in range(12)}) > 4
 
 
 @pytest.mark.parametrize("robot", ["h1", "x1"])
@@ -39,9 +39,9 @@ def test_random_start_is_free_and_the_same_for_the_same_episode(robot: str) -> N
     room = navigation_map(world, spec.footprint_radius_m + CLEARANCE_M)
     starts = []
     for trial in range(8):
-        luck = episode_seed(0, TASK.id, robot, trial)
-        drawn = started(TASK, "random", luck, robot)
-        assert drawn == started(TASK, "random", luck, robot)
+        own_seed = episode_seed(0, TASK.id, robot, trial)
+        drawn = started(TASK, "random", own_seed, robot)
+        assert drawn == started(TASK, "random", own_seed, robot)
         assert dataclasses.replace(drawn, start=TASK.start) == TASK
         start = drawn.start
         place = np.array([start.x_m, start.y_m])

@@ -20,16 +20,16 @@ def test_the_papers_cup():
 
 @pytest.mark.parametrize(("difficulty", "rate"), [("easy", 1.0), ("medium", 0.5), ("hard", 0.2)])
 def test_success_rate_of_a_difficulty(difficulty, rate):
-    luck = Contingency(CONFIG, difficulty, 5)
-    counts = Counter(luck.draw(step, "Pick", "Mug_1", "Mug", FILLED) for step in range(4000))
+    episode_seed = Contingency(CONFIG, difficulty, 5)
+    counts = Counter(episode_seed.draw(step, "Pick", "Mug_1", "Mug", FILLED) for step in range(4000))
     assert counts["success"] / 4000 == pytest.approx(rate, abs=0.03)
     assert counts["spilled"] == pytest.approx(counts["broken"], rel=0.2, abs=1)
 
 
 def test_draws_depend_on_the_key_only():
-    luck, same = Contingency(CONFIG, "medium", 7), Contingency(CONFIG, "medium", 7)
+    episode_seed, same = Contingency(CONFIG, "medium", 7), Contingency(CONFIG, "medium", 7)
     keys = [(step, arm_object) for step in range(30) for arm_object in ("Mug_1", "Mug_2")]
-    forward = [luck.draw(step, "Pick", name, "Mug", {}) for step, name in keys]
+    forward = [episode_seed.draw(step, "Pick", name, "Mug", {}) for step, name in keys]
     backward = [same.draw(step, "Pick", name, "Mug", {}) for step, name in reversed(keys)]
     assert forward == backward[::-1]
     other = Contingency(CONFIG, "medium", 8)
@@ -80,9 +80,9 @@ def test_bad_difficulties_are_refused():
 )
 def test_observed_frequencies_match_the_file(rule: OutcomeRule) -> None:
     """Chi-square over 4,000 draws per rule; the seeds are fixed, so this either holds or it does not."""
-    luck = Contingency(CONFIG, "natural", 5)
+    episode_seed = Contingency(CONFIG, "natural", 5)
     kind = rule.types[0] if rule.types else "Zebra"
-    draws = [luck.draw(step, rule.actions[0], f"{kind}_1", kind, dict(rule.state)) for step in range(4000)]
+    draws = [episode_seed.draw(step, rule.actions[0], f"{kind}_1", kind, dict(rule.state)) for step in range(4000)]
     counts = np.array([draws.count(name) for name in rule.outcomes])
     assert counts.sum() == len(draws)
     assert chisquare(counts, len(draws) * np.array(list(rule.outcomes.values()))).pvalue > 0.001
