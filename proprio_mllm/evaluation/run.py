@@ -47,7 +47,17 @@ from sim.robots.spec import load_robot
 from sim.session.contingency import load_contingency
 from sim.tasks.task import Task, load_benchmark, read_tasks
 
-__all__ = ["RUN_VERSION", "EvalRun", "evaluate", "plan_episodes", "run_folder", "select_tasks", "task_key", "weights_digest"]
+__all__ = [
+    "RUN_VERSION",
+    "EvalRun",
+    "config_hash",
+    "evaluate",
+    "plan_episodes",
+    "run_folder",
+    "select_tasks",
+    "task_key",
+    "weights_digest",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -118,7 +128,12 @@ def select_tasks(cfg: EvalConfig) -> tuple[Task, ...]:
 
 
 def config_hash(cfg: EvalConfig, digest: str) -> str:
-    """Hash of what decides results besides the rest of the episode's key."""
+    """Hash of what decides results besides the rest of the episode's key; `evaluate` derives it once and passes it on.
+
+    Args:
+        cfg: what to run.
+        digest: of the planner's weights or file, "" when it has none.
+    """
     planner = dataclasses.asdict(cfg.planner)
     for name in ("label", "train", "weights", "source", "memory"):
         del planner[name]
@@ -144,9 +159,14 @@ def task_key(task: Task) -> str:
     return hashlib.sha256(json.dumps(task.to_json(), sort_keys=True).encode()).hexdigest()[:6]
 
 
-def plan_episodes(cfg: EvalConfig, tasks: Sequence[Task], digest: str) -> list[EpisodeJob]:
-    """Every episode of a run, in the order of tasks and trials."""
-    own = config_hash(cfg, digest)
+def plan_episodes(cfg: EvalConfig, tasks: Sequence[Task], own_hash: str) -> list[EpisodeJob]:
+    """Every episode of a run, in the order of tasks and trials.
+
+    Args:
+        cfg: what to run.
+        tasks: its tasks.
+        own_hash: the run's `config_hash`.
+    """
     jobs: list[EpisodeJob] = []
     for task in tasks:
         for trial in range(cfg.trials):
@@ -158,17 +178,22 @@ def plan_episodes(cfg: EvalConfig, tasks: Sequence[Task], digest: str) -> list[E
                 difficulty=cfg.difficulty,
                 trial=trial,
                 seed=cfg.seed,
-                config_hash=f"{own}-{task_key(task)}",
+                config_hash=f"{own_hash}-{task_key(task)}",
             )
             jobs.append(EpisodeJob(fields, cfg.robot, task, episode_seed(cfg.seed, task.id, cfg.robot.name, trial)))
     return jobs
 
 
-def run_folder(cfg: EvalConfig, digest: str) -> Path:
-    """Where a run's files go; equal commands share a folder, other weights or settings have their own."""
+def run_folder(cfg: EvalConfig, own_hash: str) -> Path:
+    """Where a run's files go; equal commands share a folder, other weights or settings have their own.
+
+    Args:
+        cfg: what to run.
+        own_hash: the run's `config_hash`.
+    """
     own = dict.fromkeys([cfg.planner.name, cfg.planner.name if cfg.backend is None else cfg.backend.name])
     parts = [*own, cfg.robot.name, cfg.difficulty, *options_of(dataclasses.asdict(cfg))]
-    return Path(cfg.output) / "eval" / "-".join([*parts, config_hash(cfg, digest)[:6]])
+    return Path(cfg.output) / "eval" / "-".join([*parts, own_hash[:6]])
 
 
 def _label(cfg: EvalConfig) -> str:
@@ -181,12 +206,12 @@ def _label(cfg: EvalConfig) -> str:
     return f"{planner} on {model or backend.name}"
 
 
-def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileged: bool) -> dict[str, Any]:
+def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, own_hash: str) -> dict[str, Any]:
     return {
         "version": RUN_VERSION,
         "planner": cfg.planner.name,
         "label": _label(cfg),
-        "privileged": privileged,
+        "privileged": cfg.planner.kind == "expert",
         "robot": cfg.robot.name,
         "difficulty": cfg.difficulty,
         "contingencies": cfg.contingencies,
@@ -200,7 +225,7 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, privileg
         "tasks": cfg.tasks,
         "weights": cfg.planner.weights,
         "weights_digest": digest,
-        "config_hash": config_hash(cfg, digest),
+        "config_hash": own_hash,
         "command": "python " + " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "planned": [[job.fields.task, job.fields.category, job.fields.trial, job.fields.config_hash] for job in jobs],
         "reflection": cfg.planner.reflection,
@@ -288,12 +313,13 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
     cfg = _ready(cfg)
     planner, digest = _resolved(cfg.planner, cfg.backend)
     _check_scheduler(cfg, planner)
-    jobs = plan_episodes(cfg, select_tasks(cfg), digest)
-    folder = run_folder(cfg, digest)
+    own_hash = config_hash(cfg, digest)
+    jobs = plan_episodes(cfg, select_tasks(cfg), own_hash)
+    folder = run_folder(cfg, own_hash)
     folder.mkdir(parents=True, exist_ok=True)
-    metadata = _metadata(cfg, jobs, digest, cfg.planner.kind == "expert")
-    own = str(folder.absolute())
-    setup = WorkerSetup(planner, cfg.difficulty, cfg.start, cfg.contingencies, None, cfg.backend, own, cfg.cost_cap_usd)
+    metadata = _metadata(cfg, jobs, digest, own_hash)
+    shared = str(folder.absolute())
+    setup = WorkerSetup(planner, cfg.difficulty, cfg.start, cfg.contingencies, None, cfg.backend, shared, cfg.cost_cap_usd)
     path = folder / "ledger.jsonl"
     with Ledger(path) as ledger:
         write_text(folder / "run.json", json.dumps(metadata, indent=1) + "\n")  # not while another process runs what it says

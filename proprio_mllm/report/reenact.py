@@ -69,7 +69,7 @@ class RunTasks:
         self.cfg = build(EvalConfig, run.metadata["config"], f"{run.folder}/run.json: config")
         # The whole file: which tasks come first may have changed since, which task is meant has not.
         everything = dataclasses.replace(self.cfg, category="all", limit=None, trials=1)
-        jobs = plan_episodes(everything, select_tasks(everything), run.metadata["weights_digest"])
+        jobs = plan_episodes(everything, select_tasks(everything), run.metadata["config_hash"])
         self._tasks = {(job.task.id, _content(job.fields.config_hash)): job.task for job in jobs}
 
     def get(self, record: EpisodeRecord) -> Task | None:

@@ -16,7 +16,7 @@ from data.code_files import CodeFileError
 from data.interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest
 from proprio_mllm.backends.server import ChatServer
-from proprio_mllm.evaluation.run import _ready, evaluate, run_folder
+from proprio_mllm.evaluation.run import _ready, config_hash, evaluate, run_folder
 from sim.tasks.task import write_tasks
 
 #: Answers by the request alone, a little later for some, so that threads overtake each other.
@@ -237,7 +237,8 @@ def test_other_weights_behind_a_server_are_another_run(cfg, tmp_path) -> None:
             thread.join(30)
         assert backend is not None
         told.append(backend.revision)
-        folders.append(run_folder(dataclasses.replace(cfg, backend=backend), ""))
+        served = dataclasses.replace(cfg, backend=backend)
+        folders.append(run_folder(served, config_hash(served, "")))
     assert told == ["one", "two", "two", ""]
     assert folders[0] != folders[1] == folders[2] != folders[3]
 

@@ -16,8 +16,9 @@ import configs
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
 from data.interface.episode import Outcome
+from proprio_mllm.evaluation import run as running
 from proprio_mllm.evaluation.ledger import Ledger, LedgerError, read_ledger
-from proprio_mllm.evaluation.run import evaluate, plan_episodes, run_folder, select_tasks, weights_digest
+from proprio_mllm.evaluation.run import config_hash, evaluate, plan_episodes, run_folder, select_tasks, weights_digest
 from proprio_mllm.planners.protocol import WeightsError
 from proprio_mllm.report.runs import load_run, write_report
 from sim.tasks.task import write_tasks
@@ -109,6 +110,19 @@ def test_selection_refuses_what_is_not_there(cfg) -> None:
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:2]))
     with pytest.raises(ValueError, match="no task of category 'essential'"):
         select_tasks(only)
+
+
+def test_settings_and_weights_are_hashed_once_and_the_hash_is_in_everything(cfg, session, monkeypatch) -> None:
+    hashes = {config_hash(cfg, "w"), config_hash(cfg, "v"), config_hash(dataclasses.replace(cfg, start="turned"), "w")}
+    assert len(hashes) == 3
+    asked = []
+    monkeypatch.setattr(running, "config_hash", lambda *given: asked.append(given) or config_hash(*given))
+    run = evaluate(cfg, lambda setup, job, planner: session())
+    own = config_hash(*asked[0])
+    assert len(asked) == 1
+    assert run.metadata["config_hash"] == own
+    assert run.folder.name.endswith(f"-{own[:6]}")
+    assert {record.config_hash.partition("-")[0] for record in run.records} == {own}
 
 
 def test_split_takes_the_tasks_of_a_split_and_names_those_there_are(cfg, task) -> None:
@@ -227,8 +241,8 @@ def test_contingencies_of_ones_own_are_other_results(cfg, session, tmp_path, mon
     assert set(setups[4:]) == {"unlucky"}
     assert "unlucky" in run.folder.name
     assert json.loads((run.folder / "run.json").read_text())["contingencies"] == "unlucky"
-    before = plan_episodes(other, select_tasks(other), "")[0].fields.config_hash
+    before = config_hash(other, "")
     (folder / "unlucky.yaml").write_text(rules.replace("easy: 1.0", "easy: 0.9"))
-    assert plan_episodes(other, select_tasks(other), "")[0].fields.config_hash != before
+    assert config_hash(other, "") != before
     with pytest.raises(ValueError, match=r"no contingency config 'nope'; allowed: default, unlucky"):
         evaluate(dataclasses.replace(cfg, contingencies="nope"), opener)
