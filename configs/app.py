@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import hydra
@@ -80,7 +81,9 @@ def run_app(root: str, schema: type[T], job: Callable[[T], int], about: str, arg
         sys.stderr.write(f"{root}.py: {error}\n")
         return 2
     except COMPOSITION_ERRORS as error:
-        sys.stderr.write(f"{root}.py: {explain(error, root, [one for one in given if '=' in one] or given)}\n")
+        sys.stderr.write(
+            f"{root}.py: {explain(error, root, [one for one in given if '=' in one] or given, _own_folder(given))}\n"
+        )
         return 2
     finally:
         sys.argv = before[0]
@@ -89,6 +92,16 @@ def run_app(root: str, schema: type[T], job: Callable[[T], int], about: str, arg
         else:
             os.environ["HYDRA_FULL_ERROR"] = before[1]
     return 0
+
+
+def _own_folder(given: Sequence[str]) -> Path | None:
+    """The folder of `--config-dir`."""
+    for number, word in enumerate(given):
+        if word in ("--config-dir", "-cd"):
+            return Path(given[number + 1]) if number + 1 < len(given) else None
+        if word.startswith("--config-dir="):
+            return Path(word.partition("=")[2])
+    return None
 
 
 def _run_job(root: str, schema: type[T], job: Callable[[T], int], config: DictConfig) -> int:

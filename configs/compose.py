@@ -34,13 +34,13 @@ COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException)
 _OPEN = ("backend.", "planner.")
 
 
-def groups() -> dict[str, tuple[str, ...]]:
-    """The config groups (folders of `configs/`) with the values each allows, sorted."""
+def groups(folder: Path = CONFIG_DIR) -> dict[str, tuple[str, ...]]:
+    """The config groups (folders of `configs/`, or of the user's `--config-dir`) with the values each allows, sorted."""
     found: dict[str, tuple[str, ...]] = {}
-    for folder in sorted(path for path in CONFIG_DIR.iterdir() if path.is_dir()):
-        names = tuple(sorted(path.stem for path in folder.glob("*.yaml")))
+    for group in sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else ():
+        names = tuple(sorted(path.stem for path in group.glob("*.yaml")))
         if names:
-            found[folder.name] = names
+            found[group.name] = names
     return found
 
 
@@ -101,15 +101,18 @@ def compose(root: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
     return {str(key): value for key, value in values.items()}
 
 
-def explain(error: Exception, root: str, overrides: Sequence[str]) -> str:
+def explain(error: Exception, root: str, overrides: Sequence[str], own: Path | None = None) -> str:
     """What is wrong with overrides that did not compose, with what is allowed.
 
     Args:
         error: one of `COMPOSITION_ERRORS`.
         root: name of the root file.
         overrides: as the user gave them.
+        own: the user's folder of groups, `--config-dir`.
     """
     known = groups() | {"robot": (*groups()["robot"], *own_files("robots"))}
+    for group, names in (groups(own) if own is not None else {}).items():
+        known[group] = (*known.get(group, ()), *names)
     for override in overrides:
         key, sep, value = override.partition("=")
         if not sep and not key.startswith("~"):

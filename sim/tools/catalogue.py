@@ -113,10 +113,13 @@ def _actions() -> list[Row]:
         {
             "name": spec.name,
             "kind": spec.kind.value,
+            "meaning": spec.meaning,
             "takes_object": spec.takes_object,
+            "tool": spec.tool,
             "amount": None
             if spec.amount is None
             else {"unit": spec.amount.unit, "range": [spec.amount.low, spec.amount.high], "default": spec.amount.default},
+            "failure_codes": [code.value for code in spec.codes],
             "aliases": aliases.get(spec.name, []),
         }
         for spec in ACTIONS.values()

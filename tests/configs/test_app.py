@@ -75,6 +75,15 @@ def test_a_folder_of_groups_can_be_added(tmp_path: Path) -> None:
     assert seen[0].planner.label == "Mine"
 
 
+def test_a_mistake_beside_a_folder_of_groups_blames_no_group_of_it(tmp_path: Path, capsys) -> None:
+    (tmp_path / "planner").mkdir()
+    (tmp_path / "planner" / "mine.yaml").write_text("name: mine\nkind: random\nlabel: Mine\n")
+    assert _jobs(["--config-dir", str(tmp_path), "planner=mine", "trails=2"]) == (2, [])
+    assert "did you mean 'trials'?" in capsys.readouterr().err
+    assert _jobs([f"--config-dir={tmp_path}", "planner=mne"]) == (2, [])
+    assert "did you mean 'mine'?" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("override", "near"),
     [
