@@ -57,9 +57,9 @@ def reach(session: Session, action: Action, places: tuple[str | None, ...]) -> t
     return str(refusal.code if refusal is not None else "none"), seconds
 
 
-def things(session: Session, part: str) -> list[str]:
+def objs(session: Session, part: str) -> list[str]:
     """Objects of the running episode with a door, a drawer or a lid."""
-    return [name for name, thing in session.world.objects.items() if any(_part(m) == part for m in thing.type.moving)]
+    return [name for name, obj in session.world.objects.items() if any(_part(m) == part for m in obj.type.moving)]
 
 
 def _part(moving: MovingSpec) -> str:
@@ -97,18 +97,18 @@ def try_lid(session: Session, room: str, name: str) -> list[bool]:
     done: list[bool] = []
     for arm in Arm:
         session.reset(FreePlay(room), 0)
-        thing = session.world.objects[name]
-        for verb in ("Close", "Open") if thing.is_open else ("Open", "Close"):
-            if thing.is_open != (verb == "Close"):  # the verb before failed
+        obj = session.world.objects[name]
+        for verb in ("Close", "Open") if obj.is_open else ("Open", "Close"):
+            if obj.is_open != (verb == "Close"):  # the verb before failed
                 session.reset(FreePlay(room, states={name: {"isOpen": verb == "Close"}}), 0)
-                thing = session.world.objects[name]
+                obj = session.world.objects[name]
             place, carriers = session.world.poses.pose(name)[:3, 3], session.world.containment.parents(name)
             code, seconds = reach(session, Action(verb, arm=arm, object_id=name), (None, *PLACES[:5]))
             moved = float(np.linalg.norm(session.world.poses.pose(name)[:2, 3] - place[:2]))
             stays = session.world.containment.parents(name) == carriers and moved < STAYS_M
             done.append(code == "ok" and stays)
             line = (
-                f"{session.robot.name:5}{room:15}{name:17}{verb:7}{arm.value:6}{code:15}open {thing.openness:.2f}  "
+                f"{session.robot.name:5}{room:15}{name:17}{verb:7}{arm.value:6}{code:15}open {obj.openness:.2f}  "
                 f"moved_m {moved:.3f}{'' if stays else ' !'}  plan_s {seconds:.2f}"
             )
             print(line, flush=True)
@@ -134,7 +134,7 @@ def main() -> None:
             done: list[bool] = []
             for room in arguments.rooms:
                 session.reset(FreePlay(room), 0)
-                for name in things(session, part):
+                for name in objs(session, part):
                     done += (try_lid if part == "lids" else try_door)(session, room, name)
             totals.append(f"{robot:5}{part:8}{sum(done)} of {len(done)}")
         session.close()

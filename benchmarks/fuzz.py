@@ -168,7 +168,7 @@ def _arm_call(rng: np.random.Generator, objects: Sequence[str], focus: str, arm:
 
 
 def _control_call(rng: np.random.Generator, objects: Sequence[str]) -> dict[str, Any]:
-    thing = objects[int(rng.integers(len(objects)))]
+    obj = objects[int(rng.integers(len(objects)))]
     position = {"x": float(rng.uniform(-3, 3)), "y": float(rng.uniform(-3, 3)), "z": float(rng.uniform(0, 1.5))}
     options: tuple[dict[str, Any], ...] = (
         {"action": "Undo"},
@@ -177,9 +177,9 @@ def _control_call(rng: np.random.Generator, objects: Sequence[str]) -> dict[str,
         {"action": "LoadState", "name": "a"},
         {"action": "Pass"},
         {"action": "GetReachablePositions"},
-        {"action": "GetInteractablePoses", "objectId": thing, "maxPoses": 5},
+        {"action": "GetInteractablePoses", "objectId": obj, "maxPoses": 5},
         {"action": "TP", "x": position["x"], "y": position["y"], "rotation": float(rng.uniform(-360, 360))},
-        {"action": "SetObjectPoses", "objectPoses": [{"objectName": thing, "position": position}]},
+        {"action": "SetObjectPoses", "objectPoses": [{"objectName": obj, "position": position}]},
     )
     return options[int(rng.integers(len(options)))]
 
@@ -212,12 +212,12 @@ def check(controller: Controller, event: Event | None) -> list[str]:
     if float(np.abs(data.qvel).max()) > _MAX_SPEED_M_S:
         wrong.append(f"something moves at {float(np.abs(data.qvel).max()):.0f} m/s")
     x0, y0, x1, y1 = world.room.bounds
-    for name, thing in world.objects.items():
-        x, y, z = data.xpos[thing.body_id]
+    for name, obj in world.objects.items():
+        x, y, z = data.xpos[obj.body_id]
         if not (x0 - 0.3 <= x <= x1 + 0.3 and y0 - 0.3 <= y <= y1 + 0.3 and -0.05 <= z <= 3.5):
             wrong.append(f"{name} is lost at {x:.2f} {y:.2f} {z:.2f}")
-        if not -60.0 <= thing.state.temperature <= 300.0:
-            wrong.append(f"{name} has {thing.state.temperature} degrees")
+        if not -60.0 <= obj.state.temperature <= 300.0:
+            wrong.append(f"{name} has {obj.state.temperature} degrees")
     robot = world.robot
     assert robot is not None
     for joint in robot.joints:
@@ -238,7 +238,7 @@ def _check_holders(controller: Controller) -> list[str]:
     world = controller.session.world
     wrong: list[str] = []
     for arm in ("left", "right"):
-        held = [name for name, thing in world.objects.items() if arm in thing.held_by]
+        held = [name for name, obj in world.objects.items() if arm in obj.held_by]
         if len(held) > 1 or bool(held) != world.grasps.constraints.holds(arm):
             wrong.append(
                 f"the {arm} hand holds {held}, its constraint is {'on' if world.grasps.constraints.holds(arm) else 'off'}"

@@ -149,10 +149,10 @@ def nodes(plan: Sequence[str], done: Sequence[tuple[str, str | None]]) -> list[d
             kind = "occupy" if action.name in OCCUPIES else "release" if action.name in RELEASES else "operate"
             kind = "tool-use" if action.name in TOOLS else kind
             name = f"n{len(found) + 1}"
-            about = [thing for thing in (target, item if kind in ("release", "tool-use") else None) if thing is not None]
+            about = [obj for obj in (target, item if kind in ("release", "tool-use") else None) if obj is not None]
             text = replace(action, arm=None).to_text() if action.arm is None else f"{action.name}({target or ''})"
             node: dict[str, object] = {"id": name, "action": text, "type": kind, "arms": 2 if arm == "both" else 1}
-            node["after"] = list(dict.fromkeys(touched[thing] for thing in about if thing in touched))
+            node["after"] = list(dict.fromkeys(touched[obj] for obj in about if obj in touched))
             found.append(node | ({"item": item} if kind in ("release", "tool-use") else {}) | {"at": where or None})
             touched |= dict.fromkeys(about, name)
     end = {"id": "end", "action": "Done()", "type": "complete", "arms": 1, "after": [node["id"] for node in found]}

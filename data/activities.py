@@ -47,12 +47,12 @@ def _choice(script: Script, options: tuple[str, ...] | list[str]) -> str:
 def _thing(script: Script, hands: int) -> str:
     """What is handled: the same thing in all of a clip, and `the` after its first mention."""
     one = ("a cup", "a bottle", "an object", "a small box", "a plate", "a book")
-    known = script.things.get(hands)
+    known = script.objs.get(hands)
     if known is not None:
         return known
-    thing = _choice(script, one if hands == 1 else ("a box", "a heavy object", "a pot", "a basket", "a tray"))
-    script.things[hands] = f"the {thing.split(' ', 1)[1]}"
-    return thing
+    obj = _choice(script, one if hands == 1 else ("a box", "a heavy object", "a pot", "a basket", "a tray"))
+    script.objs[hands] = f"the {obj.split(' ', 1)[1]}"
+    return obj
 
 
 def _point(script: Script, side: int, height: str, width: float | None = None, direction: str = "in front") -> Array:
@@ -259,12 +259,12 @@ def pick(script: Script) -> Phrases:
     script.wait(0.35)
     script.hand(side, np.array([0.28, 0.2 if side == 0 else -0.2, 1.1]), seconds, advance=False)
     _stand(script, seconds)
-    name, thing = _SIDES[side], _thing(script, 1)
+    name, obj = _SIDES[side], _thing(script, 1)
     return [
-        f"picks up {thing} {height}{where} with the {name} hand",
-        f"grabs {thing} {height}{where} using the {name} arm",
-        f"takes {thing} {height}{where} in the {name} hand and holds it",
-        f"uses the {name} hand to pick up {thing} {height}{where}",
+        f"picks up {obj} {height}{where} with the {name} hand",
+        f"grabs {obj} {height}{where} using the {name} arm",
+        f"takes {obj} {height}{where} in the {name} hand and holds it",
+        f"uses the {name} hand to pick up {obj} {height}{where}",
     ]
 
 
@@ -280,11 +280,11 @@ def place(script: Script) -> Phrases:
     script.grip(side, 1.0)
     script.wait(0.35)
     _rest(script, (side,), seconds)
-    name, thing = _SIDES[side], _thing(script, 1)
+    name, obj = _SIDES[side], _thing(script, 1)
     return [
-        f"puts down {thing} {height}{where} with the {name} hand",
-        f"places {thing} {height}{where} using the {name} arm",
-        f"sets {thing} down {height}{where} with the {name} hand",
+        f"puts down {obj} {height}{where} with the {name} hand",
+        f"places {obj} {height}{where} using the {name} arm",
+        f"sets {obj} down {height}{where} with the {name} hand",
     ]
 
 
@@ -311,11 +311,11 @@ def carry(script: Script) -> Phrases:
     ]
     distance = float(script.rng.uniform(0.8, 1.8)) * (1.0 if way == 0.0 else 0.5)
     script.walk(distance, direction_rad=way, pace=float(script.rng.uniform(0.8, 1.05)))
-    thing = _thing(script, 2)
+    obj = _thing(script, 2)
     return [
-        f"carries {thing} {where} with both hands",
-        f"steps {where} while holding {thing} in both hands",
-        f"moves {thing} {where} with both arms",
+        f"carries {obj} {where} with both hands",
+        f"steps {where} while holding {obj} in both hands",
+        f"moves {obj} {where} with both arms",
     ]
 
 
@@ -339,8 +339,8 @@ def roam(script: Script) -> Phrases:
         )
     _rest(script, (0, 1), 0.9)
     if carries:
-        thing = _thing(script, 2)
-        return [f"steps about with {thing} in both hands", f"turns here and there while carrying {thing}"]
+        obj = _thing(script, 2)
+        return [f"steps about with {obj} in both hands", f"turns here and there while carrying {obj}"]
     return ["steps about and turns, moving the arms", "walks to and fro in a small space", "steps around with both arms moving"]
 
 
@@ -360,11 +360,11 @@ def shift(script: Script) -> Phrases:
         script.posture(drop, lean, seconds)
         script.wait(float(script.rng.uniform(0.1, 0.4)))
     _rest(script, (0, 1), 0.9)
-    name, other, thing = _SIDES[start], _SIDES[1 - start], _thing(script, 2)
+    name, other, obj = _SIDES[start], _SIDES[1 - start], _thing(script, 2)
     return [
-        f"moves {thing} from the {name} to the {other} with both hands",
-        f"swings {thing} over from the {name} side to the {other} side with both arms",
-        f"hands {thing} across the body from {name} to {other}",
+        f"moves {obj} from the {name} to the {other} with both hands",
+        f"swings {obj} over from the {name} side to the {other} side with both arms",
+        f"hands {obj} across the body from {name} to {other}",
     ]
 
 
@@ -438,11 +438,11 @@ def lift(script: Script) -> Phrases:
     script.wait(0.35)
     _both(script, _held(script, float(left[1])), seconds)
     _stand(script, seconds)
-    thing = _thing(script, 2)
+    obj = _thing(script, 2)
     return [
-        f"lifts {thing} {height} with both hands",
-        f"picks up {thing} {height} using both arms",
-        f"raises {thing} from {height[3:] if height.startswith('at ') else 'the floor'} with two hands",
+        f"lifts {obj} {height} with both hands",
+        f"picks up {obj} {height} using both arms",
+        f"raises {obj} from {height[3:] if height.startswith('at ') else 'the floor'} with two hands",
     ]
 
 
@@ -510,8 +510,8 @@ def open_door(script: Script) -> Phrases:
     script.grip(side, 0.7)
     script.wait(0.2)
     _rest(script, (side,), 0.9)
-    name, thing = _SIDES[side], _choice(script, ("a cabinet door", "a fridge", "a cupboard"))
-    return [f"opens {thing} with the {name} hand", f"pulls {thing} open {height} with the {name} hand"]
+    name, obj = _SIDES[side], _choice(script, ("a cabinet door", "a fridge", "a cupboard"))
+    return [f"opens {obj} with the {name} hand", f"pulls {obj} open {height} with the {name} hand"]
 
 
 def close_door(script: Script) -> Phrases:
@@ -523,8 +523,8 @@ def close_door(script: Script) -> Phrases:
     _sweep(script, side, arc[1:], float(script.rng.uniform(0.9, 1.4)))
     script.wait(0.2)
     _rest(script, (side,), 0.9)
-    name, thing = _SIDES[side], _choice(script, ("a cabinet door", "a fridge", "a cupboard"))
-    return [f"closes {thing} with the {name} hand", f"pushes {thing} shut {height} with the {name} hand"]
+    name, obj = _SIDES[side], _choice(script, ("a cabinet door", "a fridge", "a cupboard"))
+    return [f"closes {obj} with the {name} hand", f"pushes {obj} shut {height} with the {name} hand"]
 
 
 def pour(script: Script) -> Phrases:
@@ -547,11 +547,11 @@ def pour(script: Script) -> Phrases:
     for one in (0, 1) if steady else (side,):
         script.hand(one, None, 0.9, advance=False)
     _stand(script, 0.9)
-    name, thing = _SIDES[side], _choice(script, ("a bottle", "a kettle", "a jug"))
+    name, obj = _SIDES[side], _choice(script, ("a bottle", "a kettle", "a jug"))
     return [
-        f"pours something from {thing} with the {name} hand",
-        f"holds {thing} in the {name} hand and tilts it to pour",
-        f"fills a cup from {thing} using the {name} arm",
+        f"pours something from {obj} with the {name} hand",
+        f"holds {obj} in the {name} hand and tilts it to pour",
+        f"fills a cup from {obj} using the {name} arm",
     ]
 
 
@@ -567,11 +567,11 @@ def wipe(script: Script) -> Phrases:
         for shift in (0.13, -0.13):
             script.hand(side, centre + np.array([float(script.rng.uniform(-0.04, 0.04)), shift * sign, 0.0]), 0.35)
     _rest(script, (side,), 0.9)
-    name, thing = _SIDES[side], _choice(script, ("a table", "a counter", "a surface"))
+    name, obj = _SIDES[side], _choice(script, ("a table", "a counter", "a surface"))
     return [
-        f"wipes {thing} {height} with the {name} hand",
-        f"cleans {thing} with the {name} hand, moving it to and fro",
-        f"rubs over {thing} {height} using the {name} arm",
+        f"wipes {obj} {height} with the {name} hand",
+        f"cleans {obj} with the {name} hand, moving it to and fro",
+        f"rubs over {obj} {height} using the {name} arm",
     ]
 
 
@@ -591,11 +591,11 @@ def put_down(script: Script) -> Phrases:
         script.grip(side, 0.9)
     script.wait(0.35)
     _rest(script, (0, 1), seconds)
-    thing = _thing(script, 2)
+    obj = _thing(script, 2)
     return [
-        f"sets {thing} down {height} with both hands",
-        f"puts {thing} down {height} using both arms",
-        f"lowers {thing} with two hands and lets go of it {height}",
+        f"sets {obj} down {height} with both hands",
+        f"puts {obj} down {height} using both arms",
+        f"lowers {obj} with two hands and lets go of it {height}",
     ]
 
 

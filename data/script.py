@@ -136,12 +136,12 @@ class Script:
 
     Attributes:
         time_s: the end of what has been said so far.
-        things: what is handled with one hand and with two, by the number of hands.
+        objs: what is handled with one hand and with two, by the number of hands.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
-        self.things: dict[int, str] = {}
+        self.objs: dict[int, str] = {}
         self.time_s = float(rng.uniform(0.1, 0.4))
         self._height = Track(np.array([STANDING_HEIGHT_M + rng.uniform(-0.02, 0.01)]))
         self._standing = float(self._height.value[0])

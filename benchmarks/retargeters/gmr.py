@@ -133,9 +133,9 @@ class Robot:
     def __init__(self, about: dict[str, Any]) -> None:
         spec = mujoco.MjSpec.from_file(about["mjcf"])
         moving = {*about["leg_joints"], *about["waist_joints"], *(name for arm in about["arm_joints"] for name in arm)}
-        for things in (spec.equalities, spec.actuators, spec.sensors, spec.tendons, spec.excludes, spec.keys):
-            for thing in list(things):
-                spec.delete(thing)
+        for objs in (spec.equalities, spec.actuators, spec.sensors, spec.tendons, spec.excludes, spec.keys):
+            for obj in list(objs):
+                spec.delete(obj)
         for joint in list(spec.joints):
             if int(joint.type) != int(mujoco.mjtJoint.mjJNT_FREE) and joint.name not in moving:
                 spec.delete(joint)

@@ -133,7 +133,7 @@ class OracleJudge(Judge):
             return None
         names = {"place": "on {}", "lift": "lifted", "turn_on": "switched on", "turn_off": "switched off"}
         names |= {"close": "closed", "open": "open", "pick": "held"}
-        return all(thing in rollout.relations.get(names[verb].format(place), ()) for verb, thing, place in found.parts)
+        return all(obj in rollout.relations.get(names[verb].format(place), ()) for verb, obj, place in found.parts)
 
     def ask(self, trajectory: Trajectory, relation: str) -> str:
         """The relation's objects at the end that the robot knows of."""

@@ -126,12 +126,12 @@ def relabel(
             relation = verb.relation.format(place)
             reply = ask(relation)
             asked.append((relation, reply))
-            things = [thing for thing in parse_ids(reply, inventory) if _unique(thing, inventory) and thing != place]
-            if not things or (place and not _unique(place, inventory)):
+            objs = [obj for obj in parse_ids(reply, inventory) if _unique(obj, inventory) and obj != place]
+            if not objs or (place and not _unique(place, inventory)):
                 continue
             preposition = "in" if place.rpartition("_")[0] in _ENCLOSING else "on"
-            slots = {"a": natural_name(things[0]), "r": natural_name(place) if place else "", "pr": preposition}
-            parts.append((name, things[0], place))
+            slots = {"a": natural_name(objs[0]), "r": natural_name(place) if place else "", "pr": preposition}
+            parts.append((name, objs[0], place))
             sentences.append(verb.sentence.format(**slots))
             break
     if not sentences:
@@ -144,6 +144,6 @@ def _lowered(sentence: str) -> str:
     return sentence[0].lower() + sentence[1:-1]
 
 
-def _unique(thing: str, inventory: Sequence[str]) -> bool:
-    kind = thing.rpartition("_")[0]
+def _unique(obj: str, inventory: Sequence[str]) -> bool:
+    kind = obj.rpartition("_")[0]
     return sum(name.rpartition("_")[0] == kind for name in set(inventory)) == 1

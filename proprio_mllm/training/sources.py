@@ -136,9 +136,9 @@ class Views:
         bodies = row.view.key_bodies
         assert bodies is not None
         found: list[tuple[str, str]] = []
-        visible = [thing for thing in row.objects if int(thing["pixels"]) >= 6]
-        for thing in visible:
-            centre = np.asarray(thing["center_in_pelvis"], dtype=np.float64)
+        visible = [obj for obj in row.objects if int(obj["pixels"]) >= 6]
+        for obj in visible:
+            centre = np.asarray(obj["center_in_pelvis"], dtype=np.float64)
             for kind in kinds:
                 answer = {
                     "side": lambda c=centre: side_answer(c),
@@ -147,15 +147,15 @@ class Views:
                     "arm": lambda c=centre: arm_answer(c),
                     "shift": lambda c=centre: shift_answer(c, bodies),
                 }[kind]()
-                found.append((ask(kind, str(thing["id"]), self.style), answer))
+                found.append((ask(kind, str(obj["id"]), self.style), answer))
         order = rng.permutation(len(found))[:count]
         return [found[i] for i in order]
 
     def listing(self, row: ViewRow) -> tuple[str, str]:
         """Image to text: the names of the objects in view, nearest to the top-left corner first."""
-        visible = [thing for thing in row.objects if int(thing["pixels"]) >= 6]
-        ordered = sorted(visible, key=lambda thing: (float(thing["bbox"][0]), float(thing["bbox"][1])))
-        return ask("see", style=self.style), answers([str(thing["id"]) for thing in ordered][:8])
+        visible = [obj for obj in row.objects if int(obj["pixels"]) >= 6]
+        ordered = sorted(visible, key=lambda obj: (float(obj["bbox"][0]), float(obj["bbox"][1])))
+        return ask("see", style=self.style), answers([str(obj["id"]) for obj in ordered][:8])
 
 
 def _planning(

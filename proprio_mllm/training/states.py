@@ -32,7 +32,7 @@ def history_of(row: Mapping[str, Any]) -> list[HistoryItem]:
 
 def asked_relation(states: Mapping[str, Sequence[str]], rng: np.random.Generator) -> str:
     """A relation to ask about; mostly one in which some object is."""
-    full = [name for name, things in states.items() if things]
+    full = [name for name, objs in states.items() if objs]
     names = full if full and rng.random() < 0.7 else sorted(states)
     return names[int(rng.integers(len(names)))]
 
@@ -61,11 +61,11 @@ def states_from_log(history: Sequence[HistoryItem]) -> dict[str, tuple[str, ...]
     state = _state_after(history)
     found: dict[str, list[str]] = {word: [] for words in _WORDS.values() for word in words if word}
     for condition, (yes, no) in _WORDS.items():
-        for thing, value in state.conditions[condition].items():
+        for obj, value in state.conditions[condition].items():
             if word := yes if value else no:
-                found[word].append(thing)
-    for thing, place in state.at.items():
-        found.setdefault(f"on {place}", []).append(thing)
+                found[word].append(obj)
+    for obj, place in state.at.items():
+        found.setdefault(f"on {place}", []).append(obj)
     found["lifted"] = [] if state.lifted is None else [state.lifted]
     found["held"] = [item for item in state.held.values() if item is not None]
-    return {name: tuple(things) for name, things in found.items()}
+    return {name: tuple(objs) for name, objs in found.items()}

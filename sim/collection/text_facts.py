@@ -38,7 +38,7 @@ class TextObject:
 
     def __init__(self, object_id: str, kind: ObjectType, facts: TextFacts) -> None:
         self.object_id, self.kind, self._facts = object_id, kind, facts
-        self.movable = object_id in facts.things
+        self.movable = object_id in facts.objs
         self.pickupable = self.movable and kind.pickupable
         self.liftable = max(kind.size[:2]) >= _BROAD_M
         self.receptacle, self.openable, self.toggleable = kind.receptacle, kind.openable, kind.toggleable
@@ -119,13 +119,13 @@ class TextFacts:
 
     Attributes:
         state: who holds what, what stands on what, states of objects.
-        things: the task's movable objects, in its order.
+        objs: the task's movable objects, in its order.
         objects: all objects by id, furniture first.
     """
 
     def __init__(self, draft: Draft, scene: Scene, robot: RobotSpec) -> None:
         self._robot, self._scene = robot, scene
-        self.things = tuple(draft.objects)
+        self.objs = tuple(draft.objects)
         self.homes = dict(draft.objects)
         starts = {name: dict(state) for name, state in (*draft.states.items(), *draft.object_states.items())}
         self._mass_kg = {name: float(state["mass"]) for name, state in starts.items() if "mass" in state}
@@ -199,12 +199,12 @@ class TextFacts:
         before = {*self.state.held.values(), self.state.lifted}
         self.state.succeed(call)
         for name in before - {*self.state.held.values(), self.state.lifted, None}:
-            if name in self.things and name not in self.state.at:
+            if name in self.objs and name not in self.state.at:
                 self.state.at[name] = in_front
         self._heat()
 
     def _heat(self) -> None:
-        for name in self.things:
+        for name in self.objs:
             place = self.objects[self.state.at[name]] if name in self.state.at else None
             if place is not None and self._heats(place):
                 self._heated[name] = self._heated.get(name, 0) + 1

@@ -152,7 +152,7 @@ class _Episode:
         draft, scene = _draft(config, self.rng)
         robot = config.robots[index % len(config.robots)]
         self.world = TextWorld(draft, scene, load_robot(robot), self.rng)
-        hidden = [thing for thing in draft.objects if thing not in self.world.seen]
+        hidden = [obj for obj in draft.objects if obj not in self.world.seen]
         instruction = draft.sentences(scene.furniture, self.rng, hidden)[0]
         self._budget = int(np.ceil(1.5 * family_of(draft.family).steps)) + 2 + int(self.rng.choice((0, 0, 5, 10)))
         self._steps = min(self._budget, _MAX_STEPS)

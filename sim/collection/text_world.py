@@ -80,7 +80,7 @@ class TextWorld:
 
     def known(self) -> list[str]:
         """Ids that actions may name: furniture, and everything seen so far."""
-        return [*self._scene.furniture, *(name for name in self.facts.things if name in self.seen)]
+        return [*self._scene.furniture, *(name for name in self.facts.objs if name in self.seen)]
 
     def _band(self) -> tuple[float, float]:
         """Pelvis heights from which the arms reach what a piece of furniture carries."""
@@ -96,7 +96,7 @@ class TextWorld:
 
     def _standing_at(self, place: str) -> list[str]:
         """What is open to view on or in a piece of furniture."""
-        return [name for name in self.facts.things if self._place(name) == place and not self.facts.hidden(name)]
+        return [name for name in self.facts.objs if self._place(name) == place and not self.facts.hidden(name)]
 
     def _reaches(self, name: str) -> bool:
         place = self._place(name)
@@ -127,13 +127,13 @@ class TextWorld:
         here = ids.index(place)
         beside = [ids[i] for i in range(max(0, here - 2), min(len(ids), here + 3)) if i != here and self._rng.random() < 0.4]
         shown = {place, *beside}
-        things = [name for name in self.facts.things if self._place(name) in shown and not self.facts.hidden(name)]
-        seen = [name for name in things if name == wanted or self._rng.random() < 0.85]
+        objs = [name for name in self.facts.objs if self._place(name) in shown and not self.facts.hidden(name)]
+        seen = [name for name in objs if name == wanted or self._rng.random() < 0.85]
         self.seen.update(seen)
-        self.visible = [*(name for name in ids if name in shown), *(name for name in self.facts.things if name in seen)]
+        self.visible = [*(name for name in ids if name in shown), *(name for name in self.facts.objs if name in seen)]
         self._near = set()
         if near:
-            self._near = {place, *(name for name in things if name == wanted or self._rng.random() < 0.6)}
+            self._near = {place, *(name for name in objs if name == wanted or self._rng.random() < 0.6)}
 
     # ---- the right step
 
@@ -147,7 +147,7 @@ class TextWorld:
         door = next((arm for arm in Arm if (name := self.facts.held(arm)) is not None and name in self._bands), None)
         if door is not None and not standing:  # a hand at a door keeps the robot there: let go and begin anew
             return PlanStep((Action("Release", arm=door),)), True
-        if head.target in self.facts.things and head.target not in self.seen:
+        if head.target in self.facts.objs and head.target not in self.seen:
             carrier = self._place(head.target) or self._at
             if self._at != carrier:
                 return PlanStep((Action("GoTo", object_id=carrier),)), True
@@ -175,7 +175,7 @@ class TextWorld:
     def _with_companion(self, head: Job, arm: Arm | None, others: Sequence[Job]) -> PlanStep:
         first = head.action(arm)
         for job in others:
-            known = job.target not in self.facts.things or job.target in self.seen
+            known = job.target not in self.facts.objs or job.target in self.seen
             if arm is None or not known or not self._reaches(job.target) or self._misfit_m(job.target):
                 continue
             if ACTIONS[job.verb].kind is ActionKind.TWO_ARM or job.arm is arm:
@@ -254,9 +254,9 @@ class TextWorld:
     def _look_around(self) -> None:
         """After a turn or a step the stance is another one; what stands here comes into view."""
         self._awkward.clear()
-        things = self._standing_at(self._at)
-        self.seen.update(things)
-        self.visible += [name for name in things if name not in self.visible]
+        objs = self._standing_at(self._at)
+        self.seen.update(objs)
+        self.visible += [name for name in objs if name not in self.visible]
         if self._rng.random() < 0.7:
             self._near = set()
 
@@ -264,12 +264,12 @@ class TextWorld:
         target = action.object_id or ""
         held = self.facts.lifted if action.arm is None else self.facts.held(action.arm)
         shut = self.facts.hidden
-        before = {name for name in self.facts.things if shut(name)}
+        before = {name for name in self.facts.objs if shut(name)}
         self.facts.succeed(action, self._at or self._scene.surfaces[0])
         if action.spec.has_effect(PutDown) and held is not None:
             self._near.add(held)
         if self.facts.state.is_in(Condition.OPEN, target):
-            inside = [name for name in self.facts.things if name in before and not shut(name) and self._rng.random() < 0.8]
+            inside = [name for name in self.facts.objs if name in before and not shut(name) and self._rng.random() < 0.8]
             self.seen.update(inside)
             self.visible += [name for name in inside if name not in self.visible]
             self._near |= {name for name in inside if self._rng.random() < 0.7}

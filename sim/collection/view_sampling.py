@@ -185,7 +185,7 @@ def view_row(world: World, view: View, motion: NDArray[np.float32], seed: int) -
     assert view.segmentation is not None
     assert world.robot is not None
     names = {name: index for index, name in enumerate(type_names())}
-    lookup = np.array([names[thing.type.name] for thing in world.objects.values()] + [-1, -1], dtype=np.int16)
+    lookup = np.array([names[obj.type.name] for obj in world.objects.values()] + [-1, -1], dtype=np.int16)
     height, width = view.depth.shape
     return {
         "image": encode_png(view.rgb),

@@ -159,7 +159,7 @@ class Expert:
         heavy = session.world.containment.needs_two_hands
         two_handed = frozenset(name for name, item in session.world.objects.items() if item.movable and heavy(name))
         held = {arm: None if item == lifted else item for arm, item in session.body.hands.held.items()}
-        things = session.world.objects
+        objs = session.world.objects
         links = session.world.room.links
         return Facts(
             objects,
@@ -167,10 +167,10 @@ class Expert:
             lifted,
             two_handed,
             self._homes,
-            uncovered=frozenset(name for name, thing in things.items() if not thing.type.encloses),
-            tools={use: tuple(n for n, thing in things.items() if thing.type.has(use)) for use in ("cutter", "wiper")},
-            unsteady=frozenset(name for name, thing in things.items() if thing.type.has("unsteady")),
-            outlets=tuple(n for n in (*links, *things) if things[n].type.name in ("Faucet", "CoffeeMachine")),
+            uncovered=frozenset(name for name, obj in objs.items() if not obj.type.encloses),
+            tools={use: tuple(n for n, obj in objs.items() if obj.type.has(use)) for use in ("cutter", "wiper")},
+            unsteady=frozenset(name for name, obj in objs.items() if obj.type.has("unsteady")),
+            outlets=tuple(n for n in (*links, *objs) if objs[n].type.name in ("Faucet", "CoffeeMachine")),
             switches={furniture: switch for switch, furniture in links.items()},
             arms=self._usable,
         )
@@ -458,8 +458,8 @@ class Expert:
         """How much higher a load has to be carried so as not to run into the furniture it is brought to."""
         world, body = self._session.world, self._session.body
         load = body.hands.lifted or (None if job.arm is None else body.hands.held[job.arm])
-        thing = world.objects[job.target]
-        if not job.verb.startswith("Place") or load is None or (thing.type.encloses and not thing.type.lidded):
+        obj = world.objects[job.target]
+        if not job.verb.startswith("Place") or load is None or (obj.type.encloses and not obj.type.lidded):
             return 0.0
         spot = world.containment.free_spot(job.target, 0.03)
         if spot is None:

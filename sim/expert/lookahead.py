@@ -119,8 +119,8 @@ class Rehearsal:
     def _pull_open(self, object_id: str) -> None:
         """Puts a door or a drawer wide open; what lies in a drawer comes along."""
         world = self._session.world
-        thing, contents = world.objects[object_id], world.containment.contents(object_id)
-        for part in thing.moving:
+        obj, contents = world.objects[object_id], world.containment.contents(object_id)
+        for part in obj.moving:
             frame = world.data.xpos[world.model.jnt_bodyid[part.joint_id]]
             before = frame.copy()
             world.data.qpos[part.qpos_adr] = part.range[0] + _PULLED_OPEN * (part.range[1] - part.range[0])
@@ -128,7 +128,7 @@ class Rehearsal:
             for name in contents:
                 address = world.objects[name].qpos_adr
                 world.data.qpos[address : address + 3] += frame - before
-        thing.openness = _PULLED_OPEN
+        obj.openness = _PULLED_OPEN
         mujoco.mj_kinematics(world.model, world.data)
 
     def leads_to(self, first: Action, then: Action, stance: Stance | None = None, height_m: float | None = None) -> bool:

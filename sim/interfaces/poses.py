@@ -128,11 +128,11 @@ def _vector(entry: Mapping[str, Any], key: str, name: str) -> Array:
 
 def _set_pose(world: World, entry: Mapping[str, Any]) -> None:
     name = _name_of(entry)
-    thing = world.object(name)
-    if not thing.movable:
+    obj = world.object(name)
+    if not obj.movable:
         raise WorldError(f"{name} is furniture and stays where it is")
-    if thing.held_by:
-        raise WorldError(f"{name} is held by the {' and '.join(thing.held_by)} arm")
+    if obj.held_by:
+        raise WorldError(f"{name} is held by the {' and '.join(obj.held_by)} arm")
     position = _vector(entry, "position", name)
     x0, y0, x1, y1 = world.room.bounds
     if not (x0 <= position[0] <= x1 and y0 <= position[1] <= y1 and 0.0 <= position[2] <= world.room.wall_height):
@@ -140,7 +140,7 @@ def _set_pose(world: World, entry: Mapping[str, Any]) -> None:
     quat = np.array([1.0, 0.0, 0.0, 0.0])
     if entry.get("rotation") is not None:
         mujoco.mju_euler2Quat(quat, np.radians(_vector(entry, "rotation", name)), "XYZ")
-    adr, dof = thing.qpos_adr, thing.dof_adr
+    adr, dof = obj.qpos_adr, obj.dof_adr
     world.data.qpos[adr : adr + 3] = position
     world.data.qpos[adr + 3 : adr + 7] = quat
     world.data.qvel[dof : dof + 6] = 0.0

@@ -294,9 +294,9 @@ class Session:
         if self._certain:
             return "success"
         object_id = _subject(self.body, action)
-        thing = self.world.objects[object_id]
-        state = {name: getattr(thing.state, name) for name in ("isFilledWithLiquid", "isToggled", "isDirty", "isBroken")}
-        return self._contingency.draw(self.stats.steps, action.name, object_id, thing.type.name, state)
+        obj = self.world.objects[object_id]
+        state = {name: getattr(obj.state, name) for name in ("isFilledWithLiquid", "isToggled", "isDirty", "isBroken")}
+        return self._contingency.draw(self.stats.steps, action.name, object_id, obj.type.name, state)
 
     def assess(self, action: Action, diagnose: bool = True, pelvis_height_m: float | None = None) -> SkillFailure | None:
         """Why an action would be refused right now, None when it would be tried. Moves nothing; for the privileged expert.
@@ -336,7 +336,7 @@ class Session:
     def known_objects(self) -> tuple[str, ...]:
         """Ids that actions may name: fixed furniture, and everything seen so far in the episode."""
         known = self.world.objects.items()
-        return tuple(name for name, thing in known if self._all_known or not thing.movable or name in self._seen)
+        return tuple(name for name, obj in known if self._all_known or not obj.movable or name in self._seen)
 
     def goal_status(self) -> tuple[bool, ...]:
         """Whether each of the task's goals holds."""

@@ -102,11 +102,11 @@ def _pointings(body: Body, arm: Arm, point: Array) -> Iterator[Array]:
             yield np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
 
 
-def _grips(body: Body, arm: Arm, thing: ObjectInstance, handle: Array) -> Iterator[HandPose]:
+def _grips(body: Body, arm: Arm, obj: ObjectInstance, handle: Array) -> Iterator[HandPose]:
     """Hand poses around a bar: two parallel fingers rather close on it from both sides, five hook it anyhow."""
     grip_m = body.spec.hand.tip_m - _PAST_BAR_M
     if body.spec.hand.pinch_m is None:
-        along = _bar_axis(body, thing)
+        along = _bar_axis(body, obj)
         for pointing in _pointings(body, arm, handle):
             across = np.cross(along, pointing)
             across /= max(float(np.linalg.norm(across)), 1e-9)
@@ -115,17 +115,17 @@ def _grips(body: Body, arm: Arm, thing: ObjectInstance, handle: Array) -> Iterat
         yield HandPose(handle - grip_m * pointing, pointing)
 
 
-def _bar_axis(body: Body, thing: ObjectInstance) -> Array:
+def _bar_axis(body: Body, obj: ObjectInstance) -> Array:
     """(3,) direction along the bar of a handle."""
     model, data = body.world.model, body.world.data
-    bar = max(map(int, body.objects.part_geoms(thing, "handle")), key=lambda geom: float(np.max(model.geom_aabb[geom, 3:])))
+    bar = max(map(int, body.objects.part_geoms(obj, "handle")), key=lambda geom: float(np.max(model.geom_aabb[geom, 3:])))
     return data.geom_xmat[bar].reshape(3, 3)[:, int(np.argmax(model.geom_aabb[bar, 3:]))].copy()
 
 
-def _to_bar(body: Body, arm: Arm, wish: HandPose, bar: Sequence[int]) -> Reach | None:
+def _to_bar(body: Body, arm: Arm, hand_target: HandPose, bar: Sequence[int]) -> Reach | None:
     """How the open hand comes to a bar, straight ahead of its fingers."""
-    assert wish.pointing is not None
-    return plan_reach(body, arm, wish, -wish.pointing, 0.08, bar, pointing=0.7, closing=0.7)
+    assert hand_target.pointing is not None
+    return plan_reach(body, arm, hand_target, -hand_target.pointing, 0.08, bar, pointing=0.7, closing=0.7)
 
 
 @cached_plan
@@ -136,13 +136,13 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    arm, thing, opening = action.arm, body.thing(action.object_id), action.name == "Open"
+    arm, obj, opening = action.arm, body.obj(action.object_id), action.name == "Open"
     require(body, action)
-    part = thing.moving[0]
+    part = obj.moving[0]
     handle = body.world.data.site_xpos[part.handle_site].copy()
     low, high = part.range
     goal = low + (_OPEN_TO if opening else -0.04) * (high - low)  # shut means pushed against the stop
-    bar = tuple(map(int, body.objects.part_geoms(thing, "handle")))
+    bar = tuple(map(int, body.objects.part_geoms(obj, "handle")))
 
     def lid(body: Body, enough: int) -> Pull:
         positions = np.linspace(float(body.world.data.qpos[part.qpos_adr]), goal, _WAYPOINTS)
@@ -159,17 +159,17 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
 
     def search(body: Body) -> Pull | Push:
         if not opening:
-            push = plan_push(body, arm, thing, part)
+            push = plan_push(body, arm, obj, part)
             if push is not None:
                 return push
         best: Pull | None = None
         tried = 0
-        for wish in _grips(body, arm, thing, handle):
-            reach = _to_bar(body, arm, wish, bar)
+        for hand_target in _grips(body, arm, obj, handle):
+            reach = _to_bar(body, arm, hand_target, bar)
             if reach is None:
                 continue
             tried += 1
-            pull = _plan_pull(body, arm, part, reach, wish.position, goal, opening)
+            pull = _plan_pull(body, arm, part, reach, hand_target.position, goal, opening)
             if pull is not None and (best is None or len(pull.positions) > len(best.positions)):
                 best = pull
             if tried > 8 or (best is not None and len(best.positions) == _WAYPOINTS):
@@ -184,7 +184,7 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
         return diagnosed(body, {arm: handle}, whole_lid)
     except SkillFailure as failure:
         other_height = failure.code in (FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW)
-        if opening or thing.movable or other_height or not body.hypothesis.diagnose:
+        if opening or obj.movable or other_height or not body.hypothesis.diagnose:
             raise
         try:
             return lid(body, _PART_WAY)  # the lid of a fixture stays where it is left, and is taken again from there
@@ -192,23 +192,23 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
             raise failure from None
 
 
-def plan_handle(body: Body, arm: Arm, thing: ObjectInstance) -> Reach:
+def plan_handle(body: Body, arm: Arm, obj: ObjectInstance) -> Reach:
     """How the open hand comes to the handle of a door or drawer.
 
     Raises:
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
-    handle = body.world.poses.handle(thing.object_id)
-    bar = tuple(map(int, body.objects.part_geoms(thing, "handle")))
+    handle = body.world.poses.handle(obj.object_id)
+    bar = tuple(map(int, body.objects.part_geoms(obj, "handle")))
 
     def search(body: Body) -> Reach:
-        if thing.moving[0].spec.is_lid:
+        if obj.moving[0].spec.is_lid:
             reach = plan_tab(body, arm, handle, _pointings(body, arm, handle), bar)
             if reach is not None:
                 return reach
             raise SkillFailure(FailureCode.OBSTRUCTED)
-        for wish in _grips(body, arm, thing, handle):
-            reach = _to_bar(body, arm, wish, bar)
+        for hand_target in _grips(body, arm, obj, handle):
+            reach = _to_bar(body, arm, hand_target, bar)
             if reach is not None:
                 return reach
         raise SkillFailure(FailureCode.OBSTRUCTED)
@@ -256,7 +256,7 @@ def open_close(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
         SkillFailure: what `assess_open_close` refuses, GraspMissed, HandleSlipped, or a contingency.
     """
     assert action.object_id is not None
-    thing, opening = body.thing(action.object_id), action.name == "Open"
+    obj, opening = body.obj(action.object_id), action.name == "Open"
     outcome = ""
     for attempt in range(3 if not opening else 2):
         try:
@@ -271,11 +271,11 @@ def open_close(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
             if attempt == 0:
                 raise
             break  # what the first time has done counts
-        if thing.held_by or _share(body, pull.part) >= _OPEN_WELL if opening else _share(body, pull.part) <= _CLOSED_MAX:
+        if obj.held_by or _share(body, pull.part) >= _OPEN_WELL if opening else _share(body, pull.part) <= _CLOSED_MAX:
             return
-    if opening and _share(body, thing.moving[0]) >= _OPEN_MIN:
+    if opening and _share(body, obj.moving[0]) >= _OPEN_MIN:
         return
-    raise SkillFailure(FailureCode.HANDLE_SLIPPED, {"gap_m": _share(body, thing.moving[0])})
+    raise SkillFailure(FailureCode.HANDLE_SLIPPED, {"gap_m": _share(body, obj.moving[0])})
 
 
 def _share(body: Body, part: MovingPart) -> float:
@@ -291,13 +291,13 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
     """
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    thing, part = body.thing(action.object_id), pull.part
-    name = (thing.object_id,)
+    obj, part = body.obj(action.object_id), pull.part
+    name = (obj.object_id,)
     yield from body.hands.move(arm, pull.opening, 0.2)
     yield from body.arms.move(arm, [*pull.reach.way, pull.reach.before])
     yield from body.arms.move(arm, [pull.reach.at], speed=0.8)
     yield from body.hands.move(arm, pull.closed, 0.3)
-    touched = body.objects.part_geoms(thing, "handle")
+    touched = body.objects.part_geoms(obj, "handle")
     if action.name == "Close":  # a door or drawer can also be pushed shut at its front
         touched = np.flatnonzero(body.world.model.geom_bodyid == part.body_id)
     gap = body.probe.hand_gap_m(arm, touched)
@@ -310,20 +310,20 @@ def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
         code = FailureCode.LOCKED if outcome == "locked" else FailureCode.NOTHING_HAPPENED
         raise SkillFailure(code, contingency=outcome)
     if part.spec.is_lid:  # a lid hangs at its tab, a door at the hand around its bar
-        body.world.grasps.give_way(thing.object_id, part)
+        body.world.grasps.give_way(obj.object_id, part)
         yield from wait(0.2)
-        tab = body.world.poses.handle(thing.object_id)
-        body.world.grasps.attach(arm.value, thing.object_id, part, tab)
+        tab = body.world.poses.handle(obj.object_id)
+        body.world.grasps.attach(arm.value, obj.object_id, part, tab)
         pull = _aligned(body, arm, pull, tab)
     else:
-        body.world.grasps.attach(arm.value, thing.object_id, part)
+        body.world.grasps.attach(arm.value, obj.object_id, part)
     yield from _lead(body, arm, pull)
-    if thing.self_closing and action.name == "Open" and _share(body, part) >= _OPEN_MIN:
+    if obj.self_closing and action.name == "Open" and _share(body, part) >= _OPEN_MIN:
         return
     body.world.grasps.detach(arm.value)
     yield from body.hands.move(arm, 1.0, 0.2)
     position, hand = body.arms.hand_pose(arm)
-    ways = _off_lid(body, part, body.world.poses.handle(thing.object_id)) if part.spec.is_lid else (-0.08 * hand[:, 0],)
+    ways = _off_lid(body, part, body.world.poses.handle(obj.object_id)) if part.spec.is_lid else (-0.08 * hand[:, 0],)
     for way in ways:
         away = body.ik.solve(arm, HandPose(position + way, hand[:, 0]), start=body.arms.commanded(arm))
         if away.error_m < 0.03:
@@ -379,9 +379,9 @@ def assess_toggle(body: Body, action: Action) -> Reach:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    arm, thing = action.arm, body.thing(action.object_id)
+    arm, obj = action.arm, body.obj(action.object_id)
     require(body, action)
-    return plan_press(body, arm, body.world.poses.toggle_point(thing.object_id), (thing.object_id,))
+    return plan_press(body, arm, body.world.poses.toggle_point(obj.object_id), (obj.object_id,))
 
 
 def plan_press(body: Body, arm: Arm, point: Array, ignore: tuple[str, ...]) -> Reach:
@@ -399,8 +399,8 @@ def plan_press(body: Body, arm: Arm, point: Array, ignore: tuple[str, ...]) -> R
                 continue
             # the fingertip, as the hand will really be turned, belongs on the switch
             site = point - ahead * first.pointing - aside * first.closing
-            wish = HandPose(site, first.pointing, first.closing)
-            reach = plan_reach(body, arm, wish, -first.pointing, 0.07, ignore, 0.95, 0.9, opening=opening, start=first.q)
+            hand_target = HandPose(site, first.pointing, first.closing)
+            reach = plan_reach(body, arm, hand_target, -first.pointing, 0.07, ignore, 0.95, 0.9, opening=opening, start=first.q)
             if reach is not None:
                 return reach
         raise SkillFailure(FailureCode.OBSTRUCTED)
@@ -417,15 +417,15 @@ def toggle(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     reach = assess_toggle(body, action)
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    thing = body.thing(action.object_id)
+    obj = body.obj(action.object_id)
     yield from body.hands.move(arm, body.spec.hand.press[2], 0.2)
     yield from body.arms.move(arm, [*reach.way, reach.before])
-    yield from body.arms.touch(arm, reach.at, body.objects.part_geoms(thing, "toggle"), speed=0.7)
+    yield from body.arms.touch(arm, reach.at, body.objects.part_geoms(obj, "toggle"), speed=0.7)
     yield from wait(0.1)
-    gap = body.probe.hand_gap_m(arm, body.objects.part_geoms(thing, "toggle"))
+    gap = body.probe.hand_gap_m(arm, body.objects.part_geoms(obj, "toggle"))
     outcome = outcome_draw(action)
     if gap <= GRASP_GAP_M and outcome == "success":
-        body.world.states.set_state(thing.object_id, "isToggled", action.name == "ToggleOn")
+        body.world.states.set_state(obj.object_id, "isToggled", action.name == "ToggleOn")
     yield from body.arms.move(arm, [reach.before])
     yield from body.hands.move(arm, 1.0, 0.2)
     yield from stow(body, arm)

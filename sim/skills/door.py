@@ -59,13 +59,13 @@ class Door:
     now: float
 
     @staticmethod
-    def of(body: Body, thing: ObjectInstance, part: MovingPart) -> Door:
+    def of(body: Body, obj: ObjectInstance, part: MovingPart) -> Door:
         """Reads a door off the model."""
         model, data = body.world.model, body.world.data
         geoms = np.flatnonzero((model.geom_bodyid == part.body_id) & (model.geom_contype > 0))
         panel = max(map(int, geoms), key=lambda geom: float(model.geom_aabb[geom, 3] * model.geom_aabb[geom, 5]))
         center, half = model.geom_pos[panel], model.geom_aabb[panel, 3:]
-        frame, now = data.xmat[thing.body_id].reshape(3, 3), float(data.qpos[part.qpos_adr])
+        frame, now = data.xmat[obj.body_id].reshape(3, 3), float(data.qpos[part.qpos_adr])
         axis, anchor = data.xaxis[part.joint_id].copy(), data.xanchor[part.joint_id].copy()
         height = float(data.geom_xpos[panel][2])
         if part.spec.joint == "slide":

@@ -30,8 +30,8 @@ _BROAD_M: Final = 0.2
 class WorldObject:
     """An object of the simulator as `data.interface.facts.ObjectFacts`."""
 
-    def __init__(self, thing: ObjectInstance, body: Body) -> None:
-        self._thing, self._body = thing, body
+    def __init__(self, obj: ObjectInstance, body: Body) -> None:
+        self._thing, self._body = obj, body
 
     @property
     def object_id(self) -> str:
@@ -184,7 +184,7 @@ class WorldFacts:
 
     def object(self, object_id: str) -> WorldObject:
         """One object."""
-        return WorldObject(self._body.thing(object_id), self._body)
+        return WorldObject(self._body.obj(object_id), self._body)
 
     def carriers(self, object_id: str) -> Iterable[str]:
         """The receptacles on or in which it is, the direct one first."""
@@ -200,8 +200,8 @@ class WorldFacts:
         """What a liquid comes out of there: itself, or the tap of a basin."""
         world = self._body.world
         taps = [name for name, basin in world.room.links.items() if basin == object_id]
-        source = self._body.thing(object_id)
-        outlet = self._body.thing(taps[0]) if taps and world.liquids.spout(source) is None else source
+        source = self._body.obj(object_id)
+        outlet = self._body.obj(taps[0]) if taps and world.liquids.spout(source) is None else source
         return None if world.liquids.spout(outlet) is None else outlet.object_id
 
 

@@ -40,7 +40,7 @@ class Grasp:
         family: wrap, rim or top.
         middle: (3,) the gripped point of the object, world frame.
         seat: where that point belongs in the hand: along the fingers and along the closing direction, metres.
-        pointing, closing: wished directions of the hand, world frame.
+        pointing, closing: directions asked for of the hand, world frame.
         either_way: whether the opposite closing direction is as good.
         from_above: whether the hand comes down on the object, instead of along its fingers.
         opening: how far the hand is open on arrival.
@@ -56,7 +56,7 @@ class Grasp:
     opening: float = 1.0
 
     def hand(self, pointing: Array | None = None, closing: Array | None = None) -> HandPose:
-        """The hand pose, for the wished directions or for those that an arm can reach."""
+        """The hand pose, for the directions asked for or for those that an arm can reach."""
         x = self.pointing if pointing is None else pointing
         y = self.closing if closing is None else closing
         site = self.middle - self.seat[0] * x - self.seat[1] * y
@@ -90,38 +90,38 @@ class _Shape:
     has_grip: bool
 
 
-def _shape(body: Body, thing: ObjectInstance) -> _Shape:
-    pose = body.world.poses.pose(thing.object_id)
+def _shape(body: Body, obj: ObjectInstance) -> _Shape:
+    pose = body.world.poses.pose(obj.object_id)
     rotation = pose[:3, :3]
-    low, high = solid_box(thing)
+    low, high = solid_box(obj)
     center = pose[:3, 3] + rotation @ (0.5 * (low + high))
     half = 0.5 * (high - low)
     rise = float(np.abs(rotation[2]) @ half)
-    has_grip = "single" in thing.type.grips
-    grip = body.world.poses.grips(thing.object_id)[0] if has_grip else center
+    has_grip = "single" in obj.type.grips
+    grip = body.world.poses.grips(obj.object_id)[0] if has_grip else center
     return _Shape(center, rotation, half, float(center[2]) - rise, float(center[2]) + rise, grip, has_grip)
 
 
-def solid_box(thing: ObjectInstance) -> tuple[Array, Array]:
+def solid_box(obj: ObjectInstance) -> tuple[Array, Array]:
     """Bounding box of the parts that can be touched, in the type's frame; what stands open is left out."""
-    shut = [part for moving in thing.type.moving if thing.openness < _SHUT_SHARE for part in moving.parts]
-    parts = [part for part in (*thing.type.parts, *shut) if not part.options & {"ghost", "handle"}]
+    shut = [part for moving in obj.type.moving if obj.openness < _SHUT_SHARE for part in moving.parts]
+    parts = [part for part in (*obj.type.parts, *shut) if not part.options & {"ghost", "handle"}]
     low = np.min([np.subtract(part.center, np.multiply(0.5, part.size)) for part in parts], axis=0)
     high = np.max([np.add(part.center, np.multiply(0.5, part.size)) for part in parts], axis=0)
     return low, high
 
 
-def grasp_candidates(body: Body, arm: Arm, thing: ObjectInstance) -> Iterator[Grasp]:
+def grasp_candidates(body: Body, arm: Arm, obj: ObjectInstance) -> Iterator[Grasp]:
     """Grasps of an object, most promising first; whether the arm can do them is for the caller to find out."""
     hand = body.spec.hand
-    shape = _shape(body, thing)
+    shape = _shape(body, obj)
     shoulder = body.posture.shoulder(arm)
-    yield from _wraps(thing, shape, hand, shoulder)
-    yield from _rims(thing, shape, hand, shoulder)
+    yield from _wraps(obj, shape, hand, shoulder)
+    yield from _rims(obj, shape, hand, shoulder)
     yield from _tops(shape, hand, shoulder)
 
 
-def _wraps(thing: ObjectInstance, shape: _Shape, hand: HandSpec, shoulder: Array) -> Iterator[Grasp]:
+def _wraps(obj: ObjectInstance, shape: _Shape, hand: HandSpec, shoulder: Array) -> Iterator[Grasp]:
     """Fingers on both sides: from the side when the object is tall, from above when it is low."""
     tall = shape.top - shape.bottom > 0.09
     elevations = (-35.0, -15.0, -55.0, 0.0, -75.0) if tall else (-60.0, -80.0, -40.0, -25.0)
@@ -133,10 +133,10 @@ def _wraps(thing: ObjectInstance, shape: _Shape, hand: HandSpec, shoulder: Array
             closings += [axis for axis in shape.rotation.T if abs(float(axis[2])) < 0.3 and abs(float(axis @ level)) < 0.97]
         for closing in closings:
             if shape.has_grip:
-                radius = 0.5 * _local_width(thing, shape.rotation, closing)
+                radius = 0.5 * _local_width(obj, shape.rotation, closing)
             else:
                 radius = float(np.abs(shape.rotation.T @ closing) @ shape.half)
-                if len(thing.type.parts) and thing.type.parts[0].shape in ("cylinder", "cup", "ellipsoid", "capsule"):
+                if len(obj.type.parts) and obj.type.parts[0].shape in ("cylinder", "cup", "ellipsoid", "capsule"):
                     radius = min(radius, float(np.sort(shape.half)[1]))
             if radius > hand.max_radius_m:
                 continue
@@ -152,9 +152,9 @@ def _wraps(thing: ObjectInstance, shape: _Shape, hand: HandSpec, shoulder: Array
                 yield Grasp("wrap", middle, seat, pointing, sign * closing)
 
 
-def _rims(thing: ObjectInstance, shape: _Shape, hand: HandSpec, shoulder: Array) -> Iterator[Grasp]:
+def _rims(obj: ObjectInstance, shape: _Shape, hand: HandSpec, shoulder: Array) -> Iterator[Grasp]:
     """Fingers on both sides of the wall of a wide vessel, from above."""
-    hollow = any(part.wall_m > 0.0 for part in thing.type.parts)
+    hollow = any(part.wall_m > 0.0 for part in obj.type.parts)
     if not hollow or shape.has_grip or float(np.max(shape.half[:2])) < 0.05 or shape.top - shape.bottom < 0.04:
         return
     out = shoulder[:2] - shape.center[:2]
@@ -193,12 +193,12 @@ def _extent(rotation: Array, half: Array, direction: Array) -> float:
     return float(min(reach, np.max(half)))
 
 
-def _local_width(thing: ObjectInstance, rotation: Array, closing: Array) -> float:
+def _local_width(obj: ObjectInstance, rotation: Array, closing: Array) -> float:
     """Width of the part that is gripped: of the primitives around the grip point, along the closing direction."""
     local_closing = np.abs(rotation.T @ closing)
-    grip = np.asarray(thing.type.grips["single"][0])
+    grip = np.asarray(obj.type.grips["single"][0])
     widths = [0.02]
-    for part in thing.type.parts:
+    for part in obj.type.parts:
         half = 0.5 * np.asarray(part.size)
         if "ghost" not in part.options and np.all(np.abs(grip - np.asarray(part.center)) <= half + 0.01):
             round_part = part.shape in ("cylinder", "capsule", "ellipsoid", "cup")

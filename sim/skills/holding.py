@@ -32,8 +32,8 @@ def assess_hold(body: Body, action: Action) -> tuple[Grasp | None, Reach]:
     """
     assert action.arm is not None and action.object_id is not None
     require(body, action)
-    thing = body.thing(action.object_id)
-    return plan_pick(body, action.arm, thing) if thing.movable else (None, plan_handle(body, action.arm, thing))
+    obj = body.obj(action.object_id)
+    return plan_pick(body, action.arm, obj) if obj.movable else (None, plan_handle(body, action.arm, obj))
 
 
 def hold(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
@@ -45,27 +45,27 @@ def hold(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     grasp, reach = assess_hold(body, action)
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    thing = body.thing(action.object_id)
-    name = (thing.object_id,)
+    obj = body.obj(action.object_id)
+    name = (obj.object_id,)
     if grasp is not None:
-        yield from grip(body, arm, grasp, reach, body.objects.solid_geoms(thing))
-        gap = max(body.probe.finger_gaps_m(arm, body.objects.solid_geoms(thing)))
+        yield from grip(body, arm, grasp, reach, body.objects.solid_geoms(obj))
+        gap = max(body.probe.finger_gaps_m(arm, body.objects.solid_geoms(obj)))
     else:
         yield from body.hands.move(arm, 1.0, 0.2)
         yield from body.arms.move(arm, [*reach.way, reach.before])
         yield from body.arms.move(arm, [reach.at], speed=0.8)
         yield from body.hands.move(arm, 0.35, 0.3)
-        gap = body.probe.hand_gap_m(arm, body.objects.part_geoms(thing, "handle"))
+        gap = body.probe.hand_gap_m(arm, body.objects.part_geoms(obj, "handle"))
     outcome = outcome_draw(action)
-    if gap > GRASP_GAP_M or thing.held_by or outcome != "success":
-        taken = bool(thing.held_by)
+    if gap > GRASP_GAP_M or obj.held_by or outcome != "success":
+        taken = bool(obj.held_by)
         yield from retreat(body, arm, reach, name)
         if gap > GRASP_GAP_M:
             raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": gap})
         if taken:
             raise SkillFailure(FailureCode.ALREADY_HELD)
         raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
-    body.world.grasps.attach(arm.value, thing.object_id)
+    body.world.grasps.attach(arm.value, obj.object_id)
 
 
 def release(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
@@ -78,8 +78,8 @@ def release(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     arm = action.arm
     assert arm is not None
     require(body, action)
-    thing = body.thing(body.hands.lifted or body.hands.held[arm] or "")
-    name = thing.object_id
+    obj = body.obj(body.hands.lifted or body.hands.held[arm] or "")
+    name = obj.object_id
     body.world.grasps.detach(arm.value)
     yield from body.hands.move(arm, 1.0)
     position, hand = body.arms.hand_pose(arm)
@@ -88,7 +88,7 @@ def release(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
         yield from body.arms.move(arm, [back.q])
     yield from stow(body, arm, (name,))
     yield from wait(0.1)
-    for _ in range(int((3.0 if thing.self_closing else 1.0) / CONTROL_DT_S)):
-        if body.world.poses.speed_m_s(thing.object_id) < 0.02 and not (thing.self_closing and thing.openness > 0.02):
+    for _ in range(int((3.0 if obj.self_closing else 1.0) / CONTROL_DT_S)):
+        if body.world.poses.speed_m_s(obj.object_id) < 0.02 and not (obj.self_closing and obj.openness > 0.02):
             break
         yield

@@ -125,8 +125,8 @@ def _takings(body: Body, arm: Arm, tab: Array, pointings: Iterable[Array], bar: 
                 continue
             # the tab belongs between the fingertips of the hand as it will really be turned
             x, y = first.pointing, first.closing
-            wish = HandPose(_site(tab, how.seat, x, y), x, y)
-            reach = plan_reach(body, arm, wish, -x, 0.07, bar, 0.97, 0.95, opening=how.opening, start=first.q)
+            hand_target = HandPose(_site(tab, how.seat, x, y), x, y)
+            reach = plan_reach(body, arm, hand_target, -x, 0.07, bar, 0.97, 0.95, opening=how.opening, start=first.q)
             if reach is not None:
                 yield _Taking(reach, x, y, how)
                 break
@@ -229,8 +229,8 @@ def _follow(body: Body, arm: Arm, points: Sequence[Array], stances: Sequence[Sta
         start = postures[-1]
         missed, gap_m = np.zeros(3), np.inf
         for _ in range(_ROUNDS):
-            wish = HandPose(_site(point, held.seat, pointing, closing) - missed, pointing, closing)
-            goal = body.ik.solve(arm, wish, start=start, base=stance, pointing_weight=0.05, roll_weight=0.02)
+            hand_target = HandPose(_site(point, held.seat, pointing, closing) - missed, pointing, closing)
+            goal = body.ik.solve(arm, hand_target, start=start, base=stance, pointing_weight=0.05, roll_weight=0.02)
             site, hand = body.ik.hand_pose_at(arm, goal.q, stance)
             off = site + hand @ held.seat - point
             gap_m, start, pointing, closing = float(np.linalg.norm(off)), goal.q, hand[:, 0], hand[:, 1]

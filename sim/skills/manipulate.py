@@ -68,38 +68,38 @@ _LEVEL_RAD: Final = float(np.radians(25.0))
 _UP: Final = np.array([0.0, 0.0, 1.0])
 
 
-def plan_pick(body: Body, arm: Arm, thing: ObjectInstance) -> tuple[Grasp, Reach]:
+def plan_pick(body: Body, arm: Arm, obj: ObjectInstance) -> tuple[Grasp, Reach]:
     """The grasp and the motion to it.
 
     Raises:
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
-    found = _find_grasp(body, arm, thing, _MAX_PLANS)
+    found = _find_grasp(body, arm, obj, _MAX_PLANS)
     if found is not None:
         return found
 
     def elsewhere(body: Body) -> None:
-        if _find_grasp(body, arm, thing, _MAX_PLANS // 3) is None:
+        if _find_grasp(body, arm, obj, _MAX_PLANS // 3) is None:
             raise SkillFailure(FailureCode.OBSTRUCTED)
 
-    raise diagnose(body, {arm: body.world.poses.grips(thing.object_id)[0]}, elsewhere)
+    raise diagnose(body, {arm: body.world.poses.grips(obj.object_id)[0]}, elsewhere)
 
 
 def _find_grasp(
-    body: Body, arm: Arm, thing: ObjectInstance, limit: int, avoid: Grasp | None = None
+    body: Body, arm: Arm, obj: ObjectInstance, limit: int, avoid: Grasp | None = None
 ) -> tuple[Grasp, Reach] | None:
     """The first grasp that the arm can do and that differs from `avoid`, of at most `limit` that are within its envelope."""
     tried = 0
-    for grasp in grasp_candidates(body, arm, thing):
-        wish = grasp.hand()
+    for grasp in grasp_candidates(body, arm, obj):
+        hand_target = grasp.hand()
         if avoid is not None and avoid.family == grasp.family and float(avoid.pointing @ grasp.pointing) > 0.95:
             continue
-        if not body.ik.within(arm, wish.position, body.posture.pelvis_height_m):
+        if not body.ik.within(arm, hand_target.position, body.posture.pelvis_height_m):
             continue
         tried += 1
         if tried > limit:
             return None
-        first = body.ik.solve(arm, wish)
+        first = body.ik.solve(arm, hand_target)
         if not fulfils(first):
             continue
         # the arm points where it can: seat the object in the hand as it will really be turned
@@ -116,8 +116,8 @@ def _find_grasp(
 def stow(body: Body, arm: Arm, ignore: tuple[str | int, ...] = ()) -> Skill:
     """Brings the arm to its ready posture, or to the carrying one with something in the hand, around what is in the way."""
     held = body.hands.held[arm]
-    goal = ready_posture(body.kit, arm) if held is None or not body.thing(held).movable else _carry(body, arm, held)
-    if held is not None and body.thing(held).state.fillLitres > 0.0:
+    goal = ready_posture(body.kit, arm) if held is None or not body.obj(held).movable else _carry(body, arm, held)
+    if held is not None and body.obj(held).state.fillLitres > 0.0:
         yield from body.arms.move(arm, [*_level_way(body, arm, held, goal), goal], speed=_CARE)
         return
     way = route(body, arm, body.arms.commanded(arm), goal, ignore)
@@ -140,7 +140,7 @@ def _carry(body: Body, arm: Arm, held: str) -> Array:
         pointing, closing = about @ pointing, about @ closing
     place_at = body.ik.hand_at(arm, usual)
     solved = body.ik.solve(arm, HandPose(place_at, pointing, closing), start=usual, roll_weight=0.2)
-    if body.thing(held).state.fillLitres > 0.0:
+    if body.obj(held).state.fillLitres > 0.0:
         up = hand.T @ body.world.poses.pose(held)[:3, 2]
         return _level(body, arm, up, place_at, pointing, closing, solved.q if solved.error_m < 0.05 else usual)
     return solved.q if solved.error_m < 0.05 else usual
@@ -223,15 +223,15 @@ def pick(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     grasp, reach = assess_pick(body, action)
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    thing = body.thing(action.object_id)
-    name = (thing.object_id,)
-    geoms = body.objects.solid_geoms(thing)
+    obj = body.obj(action.object_id)
+    name = (obj.object_id,)
+    geoms = body.objects.solid_geoms(obj)
     yield from grip(body, arm, grasp, reach, geoms)
     gaps = body.probe.finger_gaps_m(arm, geoms)
     if max(gaps) > GRASP_GAP_M:  # look again and try another way once
         yield from body.hands.move(arm, 1.0, 0.2)
         yield from body.arms.move(arm, [reach.before])
-        again = _find_grasp(body, arm, thing, _MAX_PLANS, avoid=grasp)
+        again = _find_grasp(body, arm, obj, _MAX_PLANS, avoid=grasp)
         if again is not None:
             grasp, reach = again
             yield from grip(body, arm, grasp, reach, geoms)
@@ -239,16 +239,16 @@ def pick(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     if max(gaps) > GRASP_GAP_M:
         yield from retreat(body, arm, reach, name)
         raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": max(gaps)})
-    if thing.held_by:
+    if obj.held_by:
         yield from retreat(body, arm, reach, name)
         raise SkillFailure(FailureCode.ALREADY_HELD)
     outcome = outcome_draw(action)
-    body.world.grasps.attach(arm.value, thing.object_id)
+    body.world.grasps.attach(arm.value, obj.object_id)
     yield from _lift(body, arm)
     if outcome != "success":
-        yield from _bad_luck(body, arm, thing, outcome)
+        yield from _bad_luck(body, arm, obj, outcome)
     yield from stow(body, arm, name)
-    if body.hands.held[arm] != thing.object_id:
+    if body.hands.held[arm] != obj.object_id:
         raise SkillFailure(FailureCode.DROPPED)
 
 
@@ -271,22 +271,22 @@ def _lift(body: Body, arm: Arm) -> Skill:
         yield from body.arms.move(arm, [up.q])
 
 
-def _bad_luck(body: Body, arm: Arm, thing: ObjectInstance, outcome: str) -> Skill:
+def _bad_luck(body: Body, arm: Arm, obj: ObjectInstance, outcome: str) -> Skill:
     """Acts out a contingency of Pick: the object leaves the hand, and may break or lose its liquid."""
     codes = {"slipped": FailureCode.SLIPPED, "spilled": FailureCode.SPILLED, "broken": FailureCode.BROKE}
     code = codes.get(outcome, FailureCode.NOTHING_HAPPENED)
     body.world.grasps.detach(arm.value)
     if outcome in ("spilled", "broken"):
-        body.world.liquids.spill(thing)
-    if outcome == "broken" and thing.type.has("breakable"):
-        body.world.states.set_state(thing.object_id, "isBroken", True)
+        body.world.liquids.spill(obj)
+    if outcome == "broken" and obj.type.has("breakable"):
+        body.world.states.set_state(obj.object_id, "isBroken", True)
     yield from body.hands.move(arm, 1.0)
     yield from wait(0.3)
-    yield from stow(body, arm, (thing.object_id,))
+    yield from stow(body, arm, (obj.object_id,))
     raise SkillFailure(code, contingency=outcome)
 
 
-def plan_place(body: Body, arm: Arm, thing: ObjectInstance, receptacle: ObjectInstance) -> tuple[Array, Reach, Array]:
+def plan_place(body: Body, arm: Arm, obj: ObjectInstance, receptacle: ObjectInstance) -> tuple[Array, Reach, Array]:
     """Where the held object goes and how the arm brings it there.
 
     Returns:
@@ -295,11 +295,11 @@ def plan_place(body: Body, arm: Arm, thing: ObjectInstance, receptacle: ObjectIn
     Raises:
         SkillFailure: ReceptacleFull, TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
-    spots = body.workspace.free_spots(thing, receptacle, arm)
+    spots = body.workspace.free_spots(obj, receptacle, arm)
     if not spots:
         raise SkillFailure(FailureCode.RECEPTACLE_FULL)
     over_m = max(_APPROACH_PLACE_M, _rim_m(body, receptacle) - float(spots[0][2]) + _OVER_RIM_M)
-    return plan_bring(body, arm, thing, spots, (thing.object_id, receptacle.object_id), from_m=over_m)
+    return plan_bring(body, arm, obj, spots, (obj.object_id, receptacle.object_id), from_m=over_m)
 
 
 def _rim_m(body: Body, receptacle: ObjectInstance) -> float:
@@ -315,7 +315,7 @@ def _rim_m(body: Body, receptacle: ObjectInstance) -> float:
 def plan_bring(
     body: Body,
     arm: Arm,
-    thing: ObjectInstance,
+    obj: ObjectInstance,
     spots: Sequence[Array],
     ignore: Sequence[str],
     point: Array | None = None,
@@ -328,7 +328,7 @@ def plan_bring(
     Args:
         body: the robot.
         arm: the arm that holds it.
-        thing: what it holds.
+        obj: what it holds.
         spots: (3,) world points, the best first.
         ignore: ids that may be touched at the spot.
         point: (3,) point of the object that belongs above the spot, in its own frame; its frame's origin when None.
@@ -343,13 +343,13 @@ def plan_bring(
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
     position, hand = body.arms.hand_pose(arm)
-    pose = body.world.poses.pose(thing.object_id)
+    pose = body.world.poses.pose(obj.object_id)
     # the object upright again, turned about the vertical only
     tilt = upright(pose[:3, :3])
     middle = pose[:3, 3] if point is None else pose[:3, 3] + pose[:3, :3] @ point
     offset = tilt @ (middle - position)  # object frame from the hand
     pointing, closing = tilt @ hand[:, 0], tilt @ hand[:, 1]
-    lowest = _lowest(thing, tilt @ pose[:3, :3])
+    lowest = _lowest(obj, tilt @ pose[:3, :3])
     if point is not None:
         lowest -= float((tilt @ pose[:3, :3] @ point)[2])
     shoulder = body.posture.shoulder(arm)
@@ -363,8 +363,8 @@ def plan_bring(
             straight = 0.0 if now is None else float(np.arctan2(sight[1], sight[0])) - now
             for extra in (0.0, 0.35, -0.35, 0.75, -0.75):
                 turn = _turn_z(straight + extra)
-                wish = HandPose(spot + lift - turn @ offset, turn @ pointing, turn @ closing)
-                reach = plan_reach(body, arm, wish, coming_from, from_m, ignore, pointing=0.9, closing=0.93)
+                hand_target = HandPose(spot + lift - turn @ offset, turn @ pointing, turn @ closing)
+                reach = plan_reach(body, arm, hand_target, coming_from, from_m, ignore, pointing=0.9, closing=0.93)
                 if reach is not None:
                     return spot, reach, -(turn @ pointing)
         raise SkillFailure(FailureCode.OBSTRUCTED)
@@ -381,23 +381,23 @@ def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     _, reach, away = assess_place(body, action)
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    receptacle, thing = body.thing(action.object_id), body.thing(body.hands.held[arm] or "")
+    receptacle, obj = body.obj(action.object_id), body.obj(body.hands.held[arm] or "")
     outcome = outcome_draw(action)
-    name = (thing.object_id,)
+    name = (obj.object_id,)
     yield from body.arms.move(arm, [*reach.way, reach.before])
     if outcome in ("nothing", "spilled"):
         if outcome == "spilled":
-            body.world.liquids.spill(thing)
+            body.world.liquids.spill(obj)
         yield from stow(body, arm, name)
         raise SkillFailure(FailureCode.SPILLED if outcome == "spilled" else FailureCode.NOTHING_HAPPENED, contingency=outcome)
     lowering = body.arms.move(arm, [reach.at], speed=0.6)
     for _ in lowering:
         yield
-        if body.contacts.rests(thing):
+        if body.contacts.rests(obj):
             break
     yield from wait(0.04)
-    if outcome == "broken" and thing.type.has("breakable"):
-        body.world.states.set_state(thing.object_id, "isBroken", True)
+    if outcome == "broken" and obj.type.has("breakable"):
+        body.world.states.set_state(obj.object_id, "isBroken", True)
     body.world.grasps.detach(arm.value)
     yield from body.hands.move(arm, 1.0)
     position, hand = body.arms.hand_pose(arm)
@@ -405,13 +405,13 @@ def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     yield from body.arms.move(arm, [back.q if back.error_m < 0.03 else reach.before])
     yield from stow(body, arm)
     for _ in range(int(1.0 / CONTROL_DT_S)):
-        if body.world.poses.speed_m_s(thing.object_id) < 0.02:
+        if body.world.poses.speed_m_s(obj.object_id) < 0.02:
             break
         yield
     if outcome == "broken":
         raise SkillFailure(FailureCode.BROKE, contingency=outcome)
-    if receptacle.object_id not in body.world.containment.parents(thing.object_id):
-        gap = float(np.linalg.norm(body.objects.center(thing.object_id) - body.objects.center(receptacle.object_id)))
+    if receptacle.object_id not in body.world.containment.parents(obj.object_id):
+        gap = float(np.linalg.norm(body.objects.center(obj.object_id) - body.objects.center(receptacle.object_id)))
         raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})
 
 
@@ -424,8 +424,8 @@ def assess_pick(body: Body, action: Action) -> tuple[Grasp, Reach]:
     """
     assert action.arm is not None and action.object_id is not None
     require(body, action)
-    thing = body.thing(action.object_id)
-    return plan_pick(body, action.arm, thing)
+    obj = body.obj(action.object_id)
+    return plan_pick(body, action.arm, obj)
 
 
 @cached_plan
@@ -437,8 +437,8 @@ def assess_place(body: Body, action: Action) -> tuple[Array, Reach, Array]:
     """
     assert action.arm is not None and action.object_id is not None
     require(body, action)
-    held = body.thing(body.hands.held[action.arm] or "")
-    return plan_place(body, action.arm, held, body.thing(action.object_id))
+    held = body.obj(body.hands.held[action.arm] or "")
+    return plan_place(body, action.arm, held, body.obj(action.object_id))
 
 
 def reset_arm(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
@@ -471,7 +471,7 @@ def upright(rotation: Array) -> Array:
     return np.eye(3) + sine * k + (1.0 - cosine) * (k @ k)
 
 
-def _lowest(thing: ObjectInstance, rotation: Array) -> float:
+def _lowest(obj: ObjectInstance, rotation: Array) -> float:
     """Height of the lowest corner of the object's box relative to its frame, for an orientation."""
-    corners = np.stack(np.meshgrid(*zip(thing.local_min, thing.local_max, strict=True)), axis=-1).reshape(-1, 3)  # (8, 3)
+    corners = np.stack(np.meshgrid(*zip(obj.local_min, obj.local_max, strict=True)), axis=-1).reshape(-1, 3)  # (8, 3)
     return float((corners @ rotation[2]).min())

@@ -30,7 +30,7 @@ _ROUND_M: Final = 0.01
 def obstacle_rectangles(world: World, without: int = -1) -> tuple[Rectangle, ...]:
     """Rectangles on the floor of all that the base must not run into, rounded to a centimetre, except one MuJoCo body."""
     model, data = world.model, world.data
-    movable = {thing.body_id for thing in world.objects.values() if thing.held_by}
+    movable = {obj.body_id for obj in world.objects.values() if obj.held_by}
     found: set[Rectangle] = set()
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])

@@ -46,12 +46,12 @@ _CORRECTIONS: Final = 3
 _CENTRED_M: Final = 0.015
 
 
-def _opening(body: Body, thing: ObjectInstance) -> tuple[Array, float]:
+def _opening(body: Body, obj: ObjectInstance) -> tuple[Array, float]:
     """(3,) middle of a vessel's opening in the world, and its radius in metres."""
-    middle = 0.5 * (thing.local_min + thing.local_max)
-    pose = body.world.poses.pose(thing.object_id)
-    top = pose[:3, 3] + pose[:3, :3] @ np.array([middle[0], middle[1], thing.local_max[2]])
-    return top, opening_radius_m(thing)
+    middle = 0.5 * (obj.local_min + obj.local_max)
+    pose = body.world.poses.pose(obj.object_id)
+    top = pose[:3, 3] + pose[:3, :3] @ np.array([middle[0], middle[1], obj.local_max[2]])
+    return top, opening_radius_m(obj)
 
 
 @cached_plan
@@ -63,8 +63,8 @@ def assess_pour(body: Body, action: Action) -> tuple[Reach, float]:
     """
     assert action.arm is not None and action.object_id is not None
     require(body, action)
-    arm, target = action.arm, body.thing(action.object_id)
-    vessel = body.thing(body.hands.held[arm] or "")
+    arm, target = action.arm, body.obj(action.object_id)
+    vessel = body.obj(body.hands.held[arm] or "")
     top, radius = _opening(body, target)
     spots = _beside(body, arm, vessel, top, radius)
     names = (vessel.object_id, target.object_id)
@@ -138,7 +138,7 @@ def pour(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     reach, turn = assess_pour(body, action)
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    target, vessel = body.thing(action.object_id), body.thing(body.hands.held[arm] or "")
+    target, vessel = body.obj(action.object_id), body.obj(body.hands.held[arm] or "")
     outcome = outcome_draw(action)
     yield from body.arms.move(arm, [*reach.way, reach.before])
     yield from body.arms.move(arm, [reach.at], speed=0.6)
@@ -166,7 +166,7 @@ def pour(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
 
 def _outlet(body: Body, object_id: str) -> ObjectInstance:
     """The tap or machine that a liquid comes out of there."""
-    return body.thing(WorldFacts(body).outlet(object_id) or "")
+    return body.obj(WorldFacts(body).outlet(object_id) or "")
 
 
 @cached_plan
@@ -178,7 +178,7 @@ def assess_fill(body: Body, action: Action) -> Reach:
     """
     assert action.arm is not None and action.object_id is not None
     require(body, action)
-    vessel, outlet = body.thing(body.hands.held[action.arm] or ""), _outlet(body, action.object_id)
+    vessel, outlet = body.obj(body.hands.held[action.arm] or ""), _outlet(body, action.object_id)
     point = body.world.liquids.spout(outlet)
     assert point is not None
     height = float(vessel.local_max[2] - vessel.local_min[2])
@@ -199,7 +199,7 @@ def fill(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     reach = assess_fill(body, action)
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    vessel, outlet = body.thing(body.hands.held[arm] or ""), _outlet(body, action.object_id)
+    vessel, outlet = body.obj(body.hands.held[arm] or ""), _outlet(body, action.object_id)
     outcome = outcome_draw(action)
     before = vessel.state.fillLitres
     yield from body.arms.move(arm, [*reach.way, reach.before])

@@ -118,17 +118,17 @@ class Push:
         return self.way is not None or bool(np.any(np.ptp(self.stances, axis=0) > 1e-6))
 
 
-def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> Push | None:
+def plan_push(body: Body, arm: Arm, obj: ObjectInstance, part: MovingPart) -> Push | None:
     """How one arm shuts a door by pushing, with as little walking as possible; None when no way was found."""
-    if any(name is not None and not body.thing(name).movable for name in body.hands.held.values()):
+    if any(name is not None and not body.obj(name).movable for name in body.hands.held.values()):
         return None  # a hand at another door or drawer: walking would tear at it
-    door = Door.of(body, thing, part)
+    door = Door.of(body, obj, part)
     low, high = part.range
     goal = low - _PAST_SHUT * (high - low)
     count = 2 + int(np.ceil(part.travel_m(door.now - goal) / _STEP_M))
     positions = np.linspace(door.now, goal, count)
     trials = _TRIALS if body.hypothesis.pelvis_height_m is None else _TRIALS_DIAGNOSING
-    for spot in _spots(body, arm, door, thing):
+    for spot in _spots(body, arm, door, obj):
         for stances in _stances(body, arm, door, spot, positions)[:_SOLVED]:
             if trials == 0:
                 return None
@@ -139,7 +139,7 @@ def plan_push(body: Body, arm: Arm, thing: ObjectInstance, part: MovingPart) -> 
     return None
 
 
-def _spots(body: Body, arm: Arm, door: Door, thing: ObjectInstance) -> list[tuple[float, float]]:
+def _spots(body: Body, arm: Arm, door: Door, obj: ObjectInstance) -> list[tuple[float, float]]:
     """Where the fist may touch, as distances from the hinge and heights: beside the handle first, which would catch it."""
     model, data = body.world.model, body.world.data
     shoulder_m = float(body.posture.shoulder(arm)[2])
@@ -151,7 +151,7 @@ def _spots(body: Body, arm: Arm, door: Door, thing: ObjectInstance) -> list[tupl
         handle = data.site_xpos[door.part.handle_site]
         along_m, handle_z = float((handle - door.hinge(door.now)) @ door.along(door.now)), float(handle[2])
     long_m = high_m = 0.0  # half the handle's extent along the door and upwards, in excess of its thickness
-    for geom in body.objects.part_geoms(thing, "handle"):
+    for geom in body.objects.part_geoms(obj, "handle"):
         half, axes = model.geom_aabb[geom, 3:], data.geom_xmat[geom].reshape(3, 3)
         long_m = max(long_m, float(np.abs(door.along(door.now) @ axes) @ half - np.min(half)))
         high_m = max(high_m, float(np.abs(axes[2]) @ half - np.min(half)))
@@ -293,13 +293,13 @@ def _solve(body: Body, arm: Arm, door: Door, spot: tuple[float, float], position
     states = [there.probe.against_door(a, body.arms.commanded(a), door.part, door.now, fist=False) for a in Arm]
     if any(state.gap_m < (_HAND_ROOM_M if door.before(state, door.now) else _FINGERS_M) for state in states):
         return None
-    for wish in _directions(body, arm, door, spot, float(positions[0]), first):
+    for hand_target in _directions(body, arm, door, spot, float(positions[0]), first):
         postures: list[Array] = []
         out_m = _FIST_M
         for position, pose in zip(map(float, positions), stances, strict=True):
             stance = Stance(*map(float, pose))
             start = postures[-1] if postures else None
-            found = _at_face(body, arm, door, spot, position, stance, out_m, wish if start is None else None, start)
+            found = _at_face(body, arm, door, spot, position, stance, out_m, hand_target if start is None else None, start)
             if found is None:
                 break
             q, out_m = found

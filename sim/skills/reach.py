@@ -1,6 +1,6 @@
-"""From a wish for the hand to a checked arm motion, or to the failure code that says what is wrong.
+"""From a target for the hand to a checked arm motion, or to the failure code that says what is wrong.
 
-A wish that the arm cannot fulfil is told apart by trying other pelvis heights at the same stance: none helps, TooFar; a lower
+A target that the arm cannot fulfil is told apart by trying other pelvis heights at the same stance: none helps, TooFar; a lower
 one does, BodyTooHigh; a higher one does, BodyTooLow; the present one should do but every motion collides, Obstructed.
 
 Constants were chosen by hand; with them the certificates of the 359 benchmark tasks were made on both robots.
@@ -27,7 +27,7 @@ __all__ = ["Reach", "diagnose", "diagnosed", "plan_reach", "route"]
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-#: How well the fingers must agree with the wished directions (cosines) for a grasp to be tried.
+#: How well the fingers must agree with the directions asked for (cosines) for a grasp to be tried.
 MIN_POINTING: Final = 0.75
 MIN_CLOSING: Final = 0.8
 #: Largest turn of a joint between two postures that are checked on the way.
@@ -53,7 +53,7 @@ class Reach:
 
 
 def fulfils(goal: ArmGoal, pointing: float = MIN_POINTING, closing: float = MIN_CLOSING) -> bool:
-    """Whether a solved posture is close enough to its wish."""
+    """Whether a solved posture is close enough to its target."""
     return goal.error_m <= REACH_TOLERANCE_M and goal.pointing_cos >= pointing and goal.closing_cos >= closing
 
 
@@ -126,7 +126,7 @@ def route(
 def plan_reach(
     body: Body,
     arm: Arm,
-    wish: HandPose,
+    hand_target: HandPose,
     retreat: Array,
     distance_m: float,
     ignore: Sequence[str | int] = (),
@@ -140,7 +140,7 @@ def plan_reach(
     Args:
         body: the robot.
         arm: which one.
-        wish: hand pose at the target, world frame.
+        hand_target: hand pose at the target, world frame.
         retreat: unit direction from the target back to where the straight line starts.
         distance_m: length of the straight line.
         ignore: ids of objects, or numbers of geoms, that may be touched at the target.
@@ -149,14 +149,19 @@ def plan_reach(
         opening: opening of the hand on the way, None as it is.
         start: (A,) joints near the solution, when they are known.
     """
-    if not body.ik.within(arm, wish.position, body.posture.pelvis_height_m):
+    if not body.ik.within(arm, hand_target.position, body.posture.pelvis_height_m):
         return None
-    at = body.ik.solve(arm, wish, start)
+    at = body.ik.solve(arm, hand_target, start)
     if not fulfils(at, pointing, closing) or not body.probe.free(arm, [at.q], ignore, opening):
         return None
     before = None
     for share in (1.0, 0.6):
-        short = HandPose(wish.position + share * distance_m * retreat, wish.pointing, wish.closing, wish.either_way)
+        short = HandPose(
+            hand_target.position + share * distance_m * retreat,
+            hand_target.pointing,
+            hand_target.closing,
+            hand_target.either_way,
+        )
         before = body.ik.solve(arm, short, start=at.q)
         if before.error_m <= 2.0 * REACH_TOLERANCE_M and float(np.max(np.abs(before.q - at.q))) < 1.5:
             break

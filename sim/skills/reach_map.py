@@ -48,7 +48,7 @@ _POSTURE_WEIGHT: Final = 0.06
 
 @dataclass(frozen=True, slots=True)
 class HandPose:
-    """A wish for the hand.
+    """A target for the hand.
 
     Attributes:
         position: (3,) grasp site in the pelvis frame, metres.
@@ -63,7 +63,7 @@ class HandPose:
     either_way: bool = False
 
     def rotation(self, x_axis: Array, y_axis: Array) -> Array:
-        """The wish's (3, 3) rotation; axes it leaves open are taken from a given hand."""
+        """The target's (3, 3) rotation; axes it leaves open are taken from a given hand."""
         x = x_axis if self.pointing is None else self.pointing
         y = y_axis if self.closing is None else self.closing
         if self.closing is not None and self.either_way and float(self.closing @ y_axis) < 0.0:
@@ -109,24 +109,24 @@ class ReachMap:
         """How far a point lies beyond the stretched arm, negative inside."""
         return float(np.linalg.norm(point - self.shoulder)) - self.reach_m
 
-    def starts(self, wish: HandPose, count: int, radius_m: float = 0.12, near: Array | None = None) -> Array:
-        """(N <= count, A) sampled postures that fulfil a wish best, best first; at least one.
+    def starts(self, hand_target: HandPose, count: int, radius_m: float = 0.12, near: Array | None = None) -> Array:
+        """(N <= count, A) sampled postures that fulfil a target best, best first; at least one.
 
         Args:
-            wish: hand pose in the pelvis frame.
+            hand_target: hand pose in the pelvis frame.
             count: how many.
-            radius_m: how far from the wish a sampled hand may be.
+            radius_m: how far from the target a sampled hand may be.
             near: (A,) posture to stay close to, so that the arm does not wind itself up.
         """
-        rows = np.asarray(self.tree.query_ball_point(wish.position, radius_m), dtype=np.int64)
+        rows = np.asarray(self.tree.query_ball_point(hand_target.position, radius_m), dtype=np.int64)
         if len(rows) == 0:
-            rows = np.array([int(self.tree.query(wish.position)[1])])
-        cost = _POSITION_WEIGHT * np.linalg.norm(self.positions[rows] - wish.position, axis=1)
-        if wish.pointing is not None:
-            cost = cost + (1.0 - self.x_axes[rows] @ wish.pointing)
-        if wish.closing is not None:
-            along = self.y_axes[rows] @ wish.closing
-            cost = cost + (1.0 - (np.abs(along) if wish.either_way else along))
+            rows = np.array([int(self.tree.query(hand_target.position)[1])])
+        cost = _POSITION_WEIGHT * np.linalg.norm(self.positions[rows] - hand_target.position, axis=1)
+        if hand_target.pointing is not None:
+            cost = cost + (1.0 - self.x_axes[rows] @ hand_target.pointing)
+        if hand_target.closing is not None:
+            along = self.y_axes[rows] @ hand_target.closing
+            cost = cost + (1.0 - (np.abs(along) if hand_target.either_way else along))
         if near is not None:
             cost = cost + _POSTURE_WEIGHT * np.sum((self.q[rows] - near) ** 2, axis=1)
         order = np.argsort(cost, kind="stable")

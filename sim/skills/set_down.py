@@ -78,11 +78,11 @@ def assess_place_both(body: Body, action: Action) -> BothPlacement:
     """
     assert action.object_id is not None
     require(body, action)
-    receptacle, thing = body.thing(action.object_id), body.thing(body.hands.lifted or "")
-    spots = body.workspace.free_spots(thing, receptacle, None)
+    receptacle, obj = body.obj(action.object_id), body.obj(body.hands.lifted or "")
+    spots = body.workspace.free_spots(obj, receptacle, None)
     if not spots:
         raise SkillFailure(FailureCode.RECEPTACLE_FULL)
-    load = _Load.of(body, thing)
+    load = _Load.of(body, obj)
     heights = [_height_over(body, load, spot) for spot in spots]
     carried_m = body.ik.hand_height(_hold(body))
 
@@ -121,7 +121,7 @@ class _Load:
     """What both hands hold, moved with them as one rigid piece; poses are (4, 4), world frame.
 
     Attributes:
-        thing: the object.
+        obj: the object.
         pose: where it is.
         turned: as it is put down: as it is, or turned upright between the hands where it leans too much for that.
         grasps: per arm the hand in the object's frame.
@@ -129,7 +129,7 @@ class _Load:
         bottom_m: height of its lowest point now.
     """
 
-    thing: ObjectInstance
+    obj: ObjectInstance
     pose: Array
     turned: Array
     grasps: Mapping[Arm, Array]
@@ -137,18 +137,18 @@ class _Load:
     bottom_m: float
 
     @classmethod
-    def of(cls, body: Body, thing: ObjectInstance) -> _Load:
+    def of(cls, body: Body, obj: ObjectInstance) -> _Load:
         """What is held now."""
-        pose = body.world.poses.pose(thing.object_id)
+        pose = body.world.poses.pose(obj.object_id)
         hands = {arm: _pose(*body.arms.hand_pose(arm)) for arm in Arm}
-        bottom_m = float(body.world.poses.bounds(thing.object_id)[0][2])
+        bottom_m = float(body.world.poses.bounds(obj.object_id)[0][2])
         turned, sole_m = pose, float(pose[2, 3]) - bottom_m
         if float(np.arccos(np.clip(pose[2, 2], -1.0, 1.0))) > _LEANING_RAD:
             middle = 0.5 * (hands[Arm.LEFT][:3, 3] + hands[Arm.RIGHT][:3, 3])
             turn = upright(pose[:3, :3])
             turned = _pose(middle + turn @ (pose[:3, 3] - middle), turn @ pose[:3, :3])
-            sole_m = -float(thing.local_min[2])
-        return cls(thing, pose, turned, {arm: np.linalg.inv(pose) @ hand for arm, hand in hands.items()}, sole_m, bottom_m)
+            sole_m = -float(obj.local_min[2])
+        return cls(obj, pose, turned, {arm: np.linalg.inv(pose) @ hand for arm, hand in hands.items()}, sole_m, bottom_m)
 
     def hands(self, pose: Array) -> dict[Arm, HandPose]:
         """Where the hands are when the object is at a pose."""
@@ -161,8 +161,8 @@ class _Load:
 
     def sunk_m(self, tilt_rad: float) -> float:
         """How much lower its lowest point is when it leans ahead or back between the hands."""
-        held_m = float(np.mean([grasp[2, 3] for grasp in self.grasps.values()])) - float(self.thing.local_min[2])
-        depth_m = float(np.min((self.thing.local_max - self.thing.local_min)[:2]))
+        held_m = float(np.mean([grasp[2, 3] for grasp in self.grasps.values()])) - float(self.obj.local_min[2])
+        depth_m = float(np.min((self.obj.local_max - self.obj.local_min)[:2]))
         return max(0.0, 0.5 * depth_m * float(np.sin(tilt_rad)) - held_m * (1.0 - float(np.cos(tilt_rad))))
 
 
@@ -201,8 +201,8 @@ def _height_over(body: Body, load: _Load, spot: Array) -> float | None:
         top, start = load.turned.copy(), load.pose.copy()
         top[2, 3] = max(end[2, 3], top[2, 3])
         start[2, 3] += top[2, 3] - load.turned[2, 3]
-        up = body.probe.load_depths_m(load.thing, _between(load.pose, start))
-        across = body.probe.load_depths_m(load.thing, _between(top, end))
+        up = body.probe.load_depths_m(load.obj, _between(load.pose, start))
+        across = body.probe.load_depths_m(load.obj, _between(top, end))
         if max(up) <= max(up[0], TOUCH_M) and max(across) <= _SHOVE_M:
             return over_m
     return None
@@ -215,9 +215,9 @@ def _between(start: Array, end: Array) -> list[Array]:
     return [_pose(start[:3, 3] + share * way, start[:3, :3]) for share in np.linspace(0.0, 1.0, count)]
 
 
-def _under_m(body: Body, thing: ObjectInstance, placement: BothPlacement) -> float:
+def _under_m(body: Body, obj: ObjectInstance, placement: BothPlacement) -> float:
     """How far a load's lowest point is below the surface that it is brought to, negative above it."""
-    return placement.surface_m - float(body.world.poses.bounds(thing.object_id)[0][2])
+    return placement.surface_m - float(body.world.poses.bounds(obj.object_id)[0][2])
 
 
 def place_both(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
@@ -229,18 +229,18 @@ def place_both(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """
     placement = assess_place_both(body, action)
     assert action.object_id is not None
-    thing, receptacle = body.thing(body.hands.lifted or ""), body.thing(action.object_id)
+    obj, receptacle = body.obj(body.hands.lifted or ""), body.obj(action.object_id)
     hold, first = _hold(body), []
     if placement.raised is not None:
         first = [placement.raised]
         yield from body.arms.move_both(first, speed=0.6)
         yield from wait(0.1)
-        if _under_m(body, thing, placement) > -_EDGE_M:
+        if _under_m(body, obj, placement) > -_EDGE_M:
             higher = against_sag(body, body.ik.hand_height(placement.raised) - hands_m(body))
             if higher is not None:
                 first = [higher]
                 yield from body.arms.move_both(first, speed=0.5)
-        under_m = _under_m(body, thing, placement)
+        under_m = _under_m(body, obj, placement)
         if under_m > 0.0:
             yield from body.arms.move_both([hold], speed=0.6)
             raise SkillFailure(FailureCode.BODY_TOO_LOW, {"height_m": under_m + _EDGE_M})
@@ -251,23 +251,23 @@ def place_both(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
         raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
     for _ in body.arms.move_both([placement.at], speed=0.4):
         yield
-        if body.contacts.rests(thing):
+        if body.contacts.rests(obj):
             break
     yield from wait(0.1)
     for arm in Arm:
         body.world.grasps.detach(arm.value)
-    wishes = {}
+    hand_targets = {}
     outward = body.posture.turn_to_world(np.array([0.0, 1.0, 0.0]))
     for arm, sign in ((Arm.LEFT, 1.0), (Arm.RIGHT, -1.0)):
         position, hand = body.arms.hand_pose(arm)
-        wishes[arm] = HandPose(position + sign * 0.09 * outward + 0.01 * _UP, hand[:, 0], hand[:, 1])
-    apart = body.ik.solve_both(wishes, body.arms.commanded_both())
+        hand_targets[arm] = HandPose(position + sign * 0.09 * outward + 0.01 * _UP, hand[:, 0], hand[:, 1])
+    apart = body.ik.solve_both(hand_targets, body.arms.commanded_both())
     yield from body.arms.move_both([apart], speed=0.6)
     yield from body.arms.stow_both()
     for _ in range(int(0.6 / CONTROL_DT_S)):
-        if body.world.poses.speed_m_s(thing.object_id) < 0.02:
+        if body.world.poses.speed_m_s(obj.object_id) < 0.02:
             break
         yield
-    if receptacle.object_id not in body.world.containment.parents(thing.object_id):
-        gap = float(np.linalg.norm(body.objects.center(thing.object_id) - body.objects.center(receptacle.object_id)))
+    if receptacle.object_id not in body.world.containment.parents(obj.object_id):
+        gap = float(np.linalg.norm(body.objects.center(obj.object_id) - body.objects.center(receptacle.object_id)))
         raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})

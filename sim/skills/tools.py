@@ -40,9 +40,9 @@ _PRESS_M: Final = 0.012
 _PRESS_STEPS: Final = 3
 
 
-def _top(body: Body, thing: ObjectInstance) -> Array:
+def _top(body: Body, obj: ObjectInstance) -> Array:
     """(3,) world point in the middle of an object's upper side."""
-    low, high = body.world.poses.bounds(thing.object_id)
+    low, high = body.world.poses.bounds(obj.object_id)
     return np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, high[2]])
 
 
@@ -60,9 +60,9 @@ def assess_slice(body: Body, action: Action) -> Reach:
     """
     assert action.arm is not None and action.object_id is not None
     require(body, action)
-    thing, tool = body.thing(action.object_id), body.thing(body.hands.held[action.arm] or "")
-    names = (tool.object_id, thing.object_id, *body.world.containment.parents(thing.object_id)[:1])
-    return plan_bring(body, action.arm, tool, [_top(body, thing)], names, point=_blade(tool), above_m=0.002)[1]
+    obj, tool = body.obj(action.object_id), body.obj(body.hands.held[action.arm] or "")
+    names = (tool.object_id, obj.object_id, *body.world.containment.parents(obj.object_id)[:1])
+    return plan_bring(body, action.arm, tool, [_top(body, obj)], names, point=_blade(tool), above_m=0.002)[1]
 
 
 @cached_plan
@@ -74,13 +74,13 @@ def assess_clean(body: Body, action: Action) -> Reach:
     """
     assert action.arm is not None and action.object_id is not None
     require(body, action)
-    thing, tool = body.thing(action.object_id), body.thing(body.hands.held[action.arm] or "")
-    spots = [np.asarray(puddle.position) for puddle in body.world.liquids.puddles if puddle.surface == thing.object_id]
+    obj, tool = body.obj(action.object_id), body.obj(body.hands.held[action.arm] or "")
+    spots = [np.asarray(puddle.position) for puddle in body.world.liquids.puddles if puddle.surface == obj.object_id]
     if not spots:
-        spots = [_top(body, thing)] if thing.movable else body.workspace.free_spots(tool, thing, action.arm)
+        spots = [_top(body, obj)] if obj.movable else body.workspace.free_spots(tool, obj, action.arm)
     if not spots:
         raise SkillFailure(FailureCode.OBSTRUCTED)
-    return plan_bring(body, action.arm, tool, spots, (tool.object_id, thing.object_id), above_m=0.002)[1]
+    return plan_bring(body, action.arm, tool, spots, (tool.object_id, obj.object_id), above_m=0.002)[1]
 
 
 @cached_plan
@@ -92,8 +92,8 @@ def assess_use_up(body: Body, action: Action) -> Reach:
     """
     assert action.arm is not None and action.object_id is not None
     require(body, action)
-    thing = body.thing(action.object_id)
-    return plan_press(body, action.arm, _top(body, thing) - (0.0, 0.0, 0.01), (thing.object_id,))
+    obj = body.obj(action.object_id)
+    return plan_press(body, action.arm, _top(body, obj) - (0.0, 0.0, 0.01), (obj.object_id,))
 
 
 def slice_object(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
@@ -118,10 +118,10 @@ def clean(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """
     reach = assess_clean(body, action)
 
-    def effect(thing: ObjectInstance) -> None:
-        body.world.liquids.wipe(thing.object_id)
-        if thing.state.isDirty:
-            body.world.states.set_state(thing.object_id, "isDirty", False)
+    def effect(obj: ObjectInstance) -> None:
+        body.world.liquids.wipe(obj.object_id)
+        if obj.state.isDirty:
+            body.world.states.set_state(obj.object_id, "isDirty", False)
 
     yield from _apply(body, action, reach, outcome_draw, effect)
 
@@ -134,18 +134,18 @@ def use_up(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """
     reach = assess_use_up(body, action)
     assert action.arm is not None and action.object_id is not None
-    arm, thing = action.arm, body.thing(action.object_id)
+    arm, obj = action.arm, body.obj(action.object_id)
     yield from body.hands.move(arm, body.spec.hand.press[2], 0.2)
     yield from body.arms.move(arm, [*reach.way, reach.before])
-    yield from body.arms.touch(arm, reach.at, body.objects.solid_geoms(thing), speed=0.7)
+    yield from body.arms.touch(arm, reach.at, body.objects.solid_geoms(obj), speed=0.7)
     yield from wait(0.1)
-    gap = body.probe.hand_gap_m(arm, body.objects.solid_geoms(thing))
+    gap = body.probe.hand_gap_m(arm, body.objects.solid_geoms(obj))
     outcome = outcome_draw(action)
     if gap <= GRASP_GAP_M and outcome == "success":
-        body.world.states.set_state(thing.object_id, "isUsedUp", True)
+        body.world.states.set_state(obj.object_id, "isUsedUp", True)
     yield from body.arms.move(arm, [reach.before])
     yield from body.hands.move(arm, 1.0, 0.2)
-    yield from stow(body, arm, (thing.object_id,))
+    yield from stow(body, arm, (obj.object_id,))
     _judge(gap, outcome)
 
 
@@ -166,10 +166,10 @@ def _apply(
     """
     arm = action.arm
     assert arm is not None and action.object_id is not None
-    thing, tool = body.thing(action.object_id), body.thing(body.hands.held[arm] or "")
+    obj, tool = body.obj(action.object_id), body.obj(body.hands.held[arm] or "")
     yield from body.arms.move(arm, [*reach.way, reach.before])
     yield from body.arms.move(arm, [reach.at], speed=0.6)
-    mine, theirs = body.objects.solid_geoms(tool), body.objects.solid_geoms(thing)
+    mine, theirs = body.objects.solid_geoms(tool), body.objects.solid_geoms(obj)
     yield from wait(0.06)
     gap = body.probe.gap_m(mine, theirs)
     for _ in range(_PRESS_STEPS):
@@ -183,7 +183,7 @@ def _apply(
         for _ in range(_STROKES):
             yield from nudge(body, arm, _STROKE_M * along)
             yield from nudge(body, arm, -_STROKE_M * along)
-        effect(thing)
+        effect(obj)
         yield from _leave(body, arm, reach, tool)
         return
     yield from _leave(body, arm, reach, tool)

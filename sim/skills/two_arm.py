@@ -59,18 +59,18 @@ class BothReach:
     at: BothGoal
 
 
-def _sides(body: Body, thing: ObjectInstance) -> dict[Arm, tuple[Array, Array]]:
+def _sides(body: Body, obj: ObjectInstance) -> dict[Arm, tuple[Array, Array]]:
     """Per arm the point that its palm presses on and the outward normal there, world frame."""
-    pose = body.world.poses.pose(thing.object_id)
+    pose = body.world.poses.pose(obj.object_id)
     rotation = pose[:3, :3]
-    low, high = solid_box(thing)
+    low, high = solid_box(obj)
     center = pose[:3, 3] + rotation @ (0.5 * (low + high))
     half = 0.5 * (high - low)
     left = body.posture.turn_to_world(np.array([0.0, 1.0, 0.0]))
     axis = int(np.argmax([abs(float(rotation[:, 0] @ left)), abs(float(rotation[:, 1] @ left))]))
     lateral = rotation[:, axis] * np.sign(rotation[:, axis] @ left)
     points: dict[Arm, tuple[Array, Array]] = {}
-    grips = body.world.poses.grips(thing.object_id, "double") if thing.type.grips.get("double") and axis == 0 else None
+    grips = body.world.poses.grips(obj.object_id, "double") if obj.type.grips.get("double") and axis == 0 else None
     for arm, sign in ((Arm.LEFT, 1.0), (Arm.RIGHT, -1.0)):
         normal = sign * lateral
         point = center + normal * half[axis]
@@ -85,11 +85,11 @@ def _sides(body: Body, thing: ObjectInstance) -> dict[Arm, tuple[Array, Array]]:
 def _goal(body: Body, sides: Mapping[Arm, tuple[Array, Array]], apart_m: float, start: Mapping[Arm, Array] | None) -> BothGoal:
     """Both hands beside the object, `apart_m` from its surfaces, fingers ahead and palms inward."""
     ahead = body.posture.turn_to_world(np.array([0.94, 0.0, -0.34]))
-    wishes = {}
+    hand_targets = {}
     for arm, (point, normal) in sides.items():
         inward = -normal
-        wishes[arm] = HandPose(point + (apart_m - body.spec.hand.behind_m) * normal, ahead, inward)
-    return body.ik.solve_both(wishes, start)
+        hand_targets[arm] = HandPose(point + (apart_m - body.spec.hand.behind_m) * normal, ahead, inward)
+    return body.ik.solve_both(hand_targets, start)
 
 
 @cached_plan
@@ -101,9 +101,9 @@ def assess_lift(body: Body, action: Action) -> BothReach:
     """
     assert action.object_id is not None
     require(body, action)
-    thing = body.thing(action.object_id)
-    sides = _sides(body, thing)
-    name = (thing.object_id,)
+    obj = body.obj(action.object_id)
+    sides = _sides(body, obj)
+    name = (obj.object_id,)
 
     def search(body: Body) -> BothReach:
         before = _goal(body, sides, _APART_M, None)
@@ -144,26 +144,26 @@ def lift(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """
     reach = assess_lift(body, action)
     assert action.object_id is not None
-    thing = body.thing(action.object_id)
+    obj = body.obj(action.object_id)
     for arm in Arm:
         body.hands.command(arm, 1.0)
     yield from body.arms.move_both([reach.way, reach.before])
-    yield from _press(body, reach, thing)
-    gaps = {arm: body.probe.hand_gap_m(arm, body.objects.solid_geoms(thing)) for arm in Arm}
+    yield from _press(body, reach, obj)
+    gaps = {arm: body.probe.hand_gap_m(arm, body.objects.solid_geoms(obj)) for arm in Arm}
     if max(gaps.values()) > GRASP_GAP_M:
         yield from body.arms.move_both([reach.before])
         yield from body.arms.stow_both()
         raise SkillFailure(FailureCode.GRASP_MISSED, {"gap_m": max(gaps.values())})
     outcome = outcome_draw(action)
     for arm in Arm:
-        body.world.grasps.attach(arm.value, thing.object_id)
+        body.world.grasps.attach(arm.value, obj.object_id)
     first = _shifted(body, _FIRST_M, 0.0)
     yield from body.arms.move_both([first], speed=0.5)
     if outcome != "success":
         for arm in Arm:
             body.world.grasps.detach(arm.value)
         if outcome == "spilled":
-            body.world.liquids.spill(thing)
+            body.world.liquids.spill(obj)
         yield from body.arms.move_both([reach.before])
         yield from body.arms.stow_both()
         code = FailureCode.SPILLED if outcome == "spilled" else FailureCode.SLIPPED
@@ -179,9 +179,9 @@ def lift(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
         if higher is not None:
             yield from body.arms.move_both([higher], speed=0.5)
     yield from wait(0.1)
-    if body.hands.lifted != thing.object_id or thing.object_id in body.world.containment.all_parents():
+    if body.hands.lifted != obj.object_id or obj.object_id in body.world.containment.all_parents():
         for arm in Arm:
-            if thing.object_id == body.hands.held[arm] or arm.value in thing.held_by:
+            if obj.object_id == body.hands.held[arm] or arm.value in obj.held_by:
                 body.world.grasps.detach(arm.value)
         yield from body.arms.move_both([reach.before])
         yield from body.arms.stow_both()
@@ -201,9 +201,9 @@ def against_sag(body: Body, sag_m: float) -> BothGoal | None:
     return higher if higher.error_m <= BOTH_TOLERANCE_M else None
 
 
-def _press(body: Body, reach: BothReach, thing: ObjectInstance) -> Skill:
+def _press(body: Body, reach: BothReach, obj: ObjectInstance) -> Skill:
     """Moves both hands inwards; each one stops when it touches."""
-    geoms = body.objects.solid_geoms(thing)
+    geoms = body.objects.solid_geoms(obj)
     start = body.arms.commanded_both()
     steps = round(0.5 / CONTROL_DT_S)
     share = dict.fromkeys(Arm, 0.0)
@@ -219,8 +219,8 @@ def _press(body: Body, reach: BothReach, thing: ObjectInstance) -> Skill:
 def _shifted(body: Body, up_m: float, back_m: float) -> BothGoal:
     """Both hands moved by the same displacement, their orientation kept."""
     move = up_m * _UP - back_m * body.posture.turn_to_world(np.array([1.0, 0.0, 0.0]))
-    wishes = {}
+    hand_targets = {}
     for arm in Arm:
         position, hand = body.arms.hand_pose(arm)
-        wishes[arm] = HandPose(position + move, hand[:, 0], hand[:, 1])
-    return body.ik.solve_both(wishes, body.arms.commanded_both())
+        hand_targets[arm] = HandPose(position + move, hand[:, 0], hand[:, 1])
+    return body.ik.solve_both(hand_targets, body.arms.commanded_both())

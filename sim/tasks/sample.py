@@ -283,8 +283,8 @@ def _spots(empty: World, draft: Draft, rng: np.random.Generator) -> dict[str, ND
         if kind.name in BIG_TYPES:
             narrow *= OVERHANG_SHARE
         band = narrow + 0.06 if kind.name in BIG_TYPES else max(_EDGE_BAND_M, narrow + 0.05)
-        thing = empty.object(carrier)
-        was_open, thing.openness = thing.openness, 1.0
+        obj = empty.object(carrier)
+        was_open, obj.openness = obj.openness, 1.0
         other = draft.beside.get(name)
         anchor = None if other is None else spots[other][:2] if other in spots else empty.poses.pose(other)[:2, 3]
         for _ in range(12):
@@ -299,7 +299,7 @@ def _spots(empty: World, draft: Draft, rng: np.random.Generator) -> dict[str, ND
                 spots[name], spots_gap = spot, gap
             if anchor is None:
                 break
-        thing.openness = was_open
+        obj.openness = was_open
         if name in spots:
             taken.append((spots[name][:2], radius, carrier))
         if name not in spots:
@@ -309,13 +309,13 @@ def _spots(empty: World, draft: Draft, rng: np.random.Generator) -> dict[str, ND
 
 def _hand_points(world: World, object_id: str, draft: Draft, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     """Where a hand has to get to for an object of the task: one of these points will do."""
-    thing = world.object(object_id)
+    obj = world.object(object_id)
     goal = next((goal for goal in draft.goals if goal.object_id == object_id), None)
-    if thing.movable and not (thing.moving and goal is not None and goal.kind in ("open", "closed")):
+    if obj.movable and not (obj.moving and goal is not None and goal.kind in ("open", "closed")):
         return [world.poses.center(object_id)]
     if goal is not None and goal.kind.startswith("toggled"):
         return [world.poses.toggle_point(object_id)]
-    if thing.moving:
+    if obj.moving:
         return [world.poses.handle(object_id)]
     spots = [world.containment.free_spot(object_id, _SMALL_RADIUS_M, rng=rng, band_m=_EDGE_BAND_M) for _ in range(_SPOTS)]
     return [spot + (0.0, 0.0, 0.05) for spot in spots if spot is not None]

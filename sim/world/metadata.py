@@ -28,19 +28,19 @@ def temperature_name(celsius: float) -> str:
     return "Hot" if celsius > 45.0 else "RoomTemp"
 
 
-def object_metadata(world: World, thing: ObjectInstance, parents: tuple[str, ...], contents: tuple[str, ...]) -> dict[str, Any]:
+def object_metadata(world: World, obj: ObjectInstance, parents: tuple[str, ...], contents: tuple[str, ...]) -> dict[str, Any]:
     """One object's record."""
-    kind, state = thing.type, thing.state
-    low, high = box_in_world(world.data, thing)
-    position = world.data.xpos[thing.body_id]
+    kind, state = obj.type, obj.state
+    low, high = box_in_world(world.data, obj)
+    position = world.data.xpos[obj.body_id]
     center = (low + high) / 2.0
     entry: dict[str, Any] = {
-        "objectId": thing.object_id,
-        "name": thing.object_id,
+        "objectId": obj.object_id,
+        "name": obj.object_id,
         "objectType": kind.name,
         "position": _xyz(position),
         "center": _xyz(center),
-        "rotation": _euler(world, thing),
+        "rotation": _euler(world, obj),
         "distance": world.servos.distance_to((low, high)),
         "receptacle": kind.receptacle,
         "toggleable": kind.toggleable,
@@ -60,25 +60,25 @@ def object_metadata(world: World, thing: ObjectInstance, parents: tuple[str, ...
         "sliceable": kind.has("sliceable"),
         "isSliced": state.isSliced,
         "openable": kind.openable,
-        "isOpen": thing.is_open if kind.openable else False,
-        "openness": thing.openness,
-        "selfClosing": thing.self_closing,
+        "isOpen": obj.is_open if kind.openable else False,
+        "openness": obj.openness,
+        "selfClosing": obj.self_closing,
         "pickupable": kind.pickupable,
-        "isPickedUp": bool(thing.held_by),
-        "heldBy": list(thing.held_by),
-        "moveable": thing.movable and not kind.pickupable,
-        "isMoveable": thing.movable,
-        "isMoving": world.poses.speed_m_s(thing.object_id) > 0.02,
+        "isPickedUp": bool(obj.held_by),
+        "heldBy": list(obj.held_by),
+        "moveable": obj.movable and not kind.pickupable,
+        "isMoveable": obj.movable,
+        "isMoving": world.poses.speed_m_s(obj.object_id) > 0.02,
         "isHeatSource": kind.has("heat_source"),
         "isColdSource": kind.has("cold_source"),
         "temperature": temperature_name(state.temperature),
         "temperatureCelsius": state.temperature,
-        "mass": world.containment.total_mass_kg(thing.object_id) if thing.movable else 0.0,
+        "mass": world.containment.total_mass_kg(obj.object_id) if obj.movable else 0.0,
         "salientMaterials": list(kind.materials),
         "parentReceptacles": list(parents),
         "receptacleObjectIds": list(contents),
         "axisAlignedBoundingBox": {"center": _xyz(center), "size": _xyz(high - low)},
-        "objectOrientedBoundingBox": {"cornerPoints": _corners(world, thing)},
+        "objectOrientedBoundingBox": {"cornerPoints": _corners(world, obj)},
     }
     return entry
 
@@ -91,8 +91,7 @@ def world_metadata(world: World) -> dict[str, Any]:
         for parent in above:
             contents.setdefault(parent, []).append(name)
     objects = [
-        object_metadata(world, thing, parents.get(name, ()), tuple(contents.get(name, ())))
-        for name, thing in world.objects.items()
+        object_metadata(world, obj, parents.get(name, ()), tuple(contents.get(name, ()))) for name, obj in world.objects.items()
     ]
     x0, y0, x1, y1 = world.room.bounds
     record: dict[str, Any] = {
@@ -100,9 +99,9 @@ def world_metadata(world: World) -> dict[str, Any]:
         "sceneName": world.room.name,
         "sceneBounds": {"center": _xyz([(x0 + x1) / 2, (y0 + y1) / 2, 1.3]), "size": _xyz([x1 - x0, y1 - y0, 2.6])},
         "inventoryObjects": [
-            {"objectId": thing.object_id, "objectType": thing.type.name, "arms": list(thing.held_by)}
-            for thing in world.objects.values()
-            if thing.held_by
+            {"objectId": obj.object_id, "objectType": obj.type.name, "arms": list(obj.held_by)}
+            for obj in world.objects.values()
+            if obj.held_by
         ],
         "spills": world.liquids.metadata(),
         "time": world.time_s,
@@ -133,17 +132,17 @@ def _xyz(values: Any) -> dict[str, float]:
     return {"x": float(values[0]), "y": float(values[1]), "z": float(values[2])}
 
 
-def _corners(world: World, thing: ObjectInstance) -> list[list[float]]:
+def _corners(world: World, obj: ObjectInstance) -> list[list[float]]:
     """Eight corners of the box in the object's own axes, world frame, metres."""
-    ends = (thing.local_min, thing.local_max)
+    ends = (obj.local_min, obj.local_max)
     local = np.array([[ends[i][0], ends[j][1], ends[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-    rotation = world.data.xmat[thing.body_id].reshape(3, 3)
-    return (local @ rotation.T + world.data.xpos[thing.body_id]).tolist()
+    rotation = world.data.xmat[obj.body_id].reshape(3, 3)
+    return (local @ rotation.T + world.data.xpos[obj.body_id]).tolist()
 
 
-def _euler(world: World, thing: ObjectInstance) -> dict[str, float]:
+def _euler(world: World, obj: ObjectInstance) -> dict[str, float]:
     """Roll, pitch, yaw in degrees (rotations about x, y, z, in that order, in the world)."""
-    m = world.data.xmat[thing.body_id].reshape(3, 3)
+    m = world.data.xmat[obj.body_id].reshape(3, 3)
     roll = np.degrees(np.arctan2(m[2, 1], m[2, 2]))
     pitch = np.degrees(np.arcsin(np.clip(-m[2, 0], -1.0, 1.0)))
     yaw = np.degrees(np.arctan2(m[1, 0], m[0, 0]))

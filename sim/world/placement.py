@@ -25,11 +25,11 @@ _GRID_M: Final = 0.02
 _SMALL_M: Final = 0.15
 
 
-def box_in_world(data: mujoco.MjData, thing: ObjectInstance) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def box_in_world(data: mujoco.MjData, obj: ObjectInstance) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Axis-aligned bounding box (minimum, maximum) of an object with its doors closed, world frame."""
-    rotation = data.xmat[thing.body_id].reshape(3, 3)
-    center = data.xpos[thing.body_id] + rotation @ ((thing.local_min + thing.local_max) / 2.0)
-    half = np.abs(rotation) @ ((thing.local_max - thing.local_min) / 2.0)
+    rotation = data.xmat[obj.body_id].reshape(3, 3)
+    center = data.xpos[obj.body_id] + rotation @ ((obj.local_min + obj.local_max) / 2.0)
+    half = np.abs(rotation) @ ((obj.local_max - obj.local_min) / 2.0)
     return center - half, center + half
 
 
@@ -40,8 +40,8 @@ def fits_on(kind: ObjectType, place: ObjectType) -> bool:
     return any(min(s.rect[2], s.rect[3]) / 2.0 >= radius + 0.01 and (s.clearance >= height or not s.inside) for s in surfaces)
 
 
-def _is_hollow(thing: ObjectInstance) -> bool:
-    return any(part.wall_m > 0.0 for part in thing.type.parts)
+def _is_hollow(obj: ObjectInstance) -> bool:
+    return any(part.wall_m > 0.0 for part in obj.type.parts)
 
 
 def _to_world(data: mujoco.MjData, surface: Surface, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -86,7 +86,7 @@ def find_free_spot(
         (3,) world point on the surface, or None when there is no room.
     """
     skip = {receptacle.object_id, *ignore}
-    boxes = [box_in_world(data, thing) for name, thing in objects.items() if name not in skip]
+    boxes = [box_in_world(data, obj) for name, obj in objects.items() if name not in skip]
     found: list[NDArray[np.float64]] = []
     for surface in receptacle.surfaces:
         spec = surface.spec
@@ -152,15 +152,15 @@ def resting_on(data: mujoco.MjData, objects: Mapping[str, ObjectInstance]) -> di
     table belongs to the bowl.
     """
     carriers: dict[str, str] = {}
-    surfaces = [(thing, surface) for thing in objects.values() for surface in thing.surfaces]
-    for name, thing in objects.items():
-        if not thing.movable:
+    surfaces = [(obj, surface) for obj in objects.values() for surface in obj.surfaces]
+    for name, obj in objects.items():
+        if not obj.movable:
             continue
-        low, high = box_in_world(data, thing)
+        low, high = box_in_world(data, obj)
         bottom = np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])
         best = -np.inf
         for receptacle, surface in surfaces:
-            if receptacle is thing:
+            if receptacle is obj:
                 continue
             if (
                 abs(data.xpos[receptacle.body_id, 0] - bottom[0]) > 1.6
@@ -174,7 +174,7 @@ def resting_on(data: mujoco.MjData, objects: Mapping[str, ObjectInstance]) -> di
                 continue
             heap = _is_hollow(receptacle) and (receptacle.type.lidded or not surface.spec.inside)
             reach = 0.6 * surface.spec.clearance if heap else 0.03
-            if thing.held_by:
+            if obj.held_by:
                 reach = 0.006
             level = float(data.xpos[surface.body_id, 2] - surface.origin[2] + surface.spec.z)
             if -0.02 <= z - surface.spec.z <= reach and level > best:

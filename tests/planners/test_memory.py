@@ -232,8 +232,8 @@ def test_the_command_line(demos_folder: Path, tmp_path: Path, capsys: pytest.Cap
 
 
 def _demo_of(task: Task) -> Demo:
-    thing = task.goals[0].object_id or task.placements[0].object_id
-    return Demo(task.id, "h1", task.category, task.instruction, (Act(f"GoTo({thing})"),), room=task.room)
+    obj = task.goals[0].object_id or task.placements[0].object_id
+    return Demo(task.id, "h1", task.category, task.instruction, (Act(f"GoTo({obj})"),), room=task.room)
 
 
 def _what(task: Task) -> tuple[object, ...]:

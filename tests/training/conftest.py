@@ -104,7 +104,7 @@ def write_demos(folder: Path, episodes: int = 40) -> Path:
     rows = []
     for episode in range(episodes):
         image, _, _, objects = scene(rng)
-        ids = [str(thing["id"]) for thing in objects]
+        ids = [str(obj["id"]) for obj in objects]
         target = ids[episode % len(ids)]
         history: list[dict[str, str]] = []
         for step, template in enumerate(PLAN):

@@ -122,12 +122,12 @@ def _located(text: str, mentions: list[Mention]) -> str:
     pattern = re.compile(r"<(\d+)> (?:from inside|out of|from|inside of|(?:that|which) (?:is|are) (?:on|in|at|inside)) <(\d+)>")
     at = 0
     while match := pattern.search(text, at):
-        thing, place = int(match[1]), int(match[2])
+        obj, place = int(match[1]), int(match[2])
         if pouring and mentions[place].name in _POURERS:
             at = match.end(1)
             continue
-        mentions[thing] = replace(mentions[thing], place=mentions[place])
-        text = f"{text[: match.start()]}<{thing}>{text[match.end() :]}"
+        mentions[obj] = replace(mentions[obj], place=mentions[place])
+        text = f"{text[: match.start()]}<{obj}>{text[match.end() :]}"
     return text
 
 

@@ -29,14 +29,14 @@ class Goal:
     Attributes:
         kind: `held`, `on` (or in), `lifted`, `open`, `closed`, `toggled_on`, `toggled_off`, `sliced`, `clean`, `cooked`,
             `filled` or `used_up`.
-        thing: what it is about.
+        obj: what it is about.
         place: for `on`, where to; for `filled` and `cooked`, where it is done; None when nothing is said.
         tool: for `sliced` and `clean` the tool, for `filled` the vessel that is poured from.
         ajar: for `closed`, whether the door falls shut by itself.
     """
 
     kind: str
-    thing: Mention
+    obj: Mention
     place: Mention | None = None
     tool: Mention | None = None
     ajar: bool = False
@@ -59,7 +59,7 @@ class _Reader:
         self.said = sentence
         self.found: list[Goal] = []
         self.verb = ""
-        self.things: list[Mention] = []
+        self.objs: list[Mention] = []
         self.place: Mention | None = sentence.door
         self.tool: Mention | None = None
 
@@ -86,11 +86,11 @@ class _Reader:
     def _take_verb(self, word: str) -> None:
         if word == "filled":
             before, self.verb = self.verb, "filled"
-            self._emit(self.things[-1:])
+            self._emit(self.objs[-1:])
             self.verb = before
             return
         self.verb = KIND_OF[word]
-        if word in ("go", "goes") and not self.things:
+        if word in ("go", "goes") and not self.objs:
             self.verb = ""
 
     def _group(self, group: list[Mention], preposition: str) -> None:
@@ -104,9 +104,9 @@ class _Reader:
         elif preposition in INTO:
             self._put_in(group[0])
         else:
-            self.things = _merged(group)
+            self.objs = _merged(group)
             if self.verb not in ("", "on", "state"):
-                self._emit(self.things)
+                self._emit(self.objs)
 
     def _done_there(self, preposition: str) -> bool:
         """Whether a preposition tells where something is done, not where it is put or poured."""
@@ -122,15 +122,15 @@ class _Reader:
         if place is None:
             return
         if self.verb == "filled":  # pour from <b> into <a>
-            self.things = [place]
-            self._emit(self.things)
+            self.objs = [place]
+            self._emit(self.objs)
         elif self.verb == "state":
-            self.found = [g for g in self.found if g.thing not in self.things]
-            self.things = [replace(thing, place=place) for thing in self.things]
+            self.found = [g for g in self.found if g.obj not in self.objs]
+            self.objs = [replace(obj, place=place) for obj in self.objs]
         elif self.verb in ("on", "held", "lifted"):
-            self.found += [Goal("on", thing, place) for thing in self.things if thing != place]
+            self.found += [Goal("on", obj, place) for obj in self.objs if obj != place]
         if self.verb == "":  # go to it
-            self.things = [place]
+            self.objs = [place]
         else:
             self.place = place
 
@@ -138,62 +138,62 @@ class _Reader:
         if preposition in INTO:
             self._put_in(self.place or (self._opened() if self.verb == "on" else None))
         elif preposition == "from":
-            held = [goal.thing for goal in self.found if goal.kind == "held"]
+            held = [goal.obj for goal in self.found if goal.kind == "held"]
             if held:
                 self._from(held[-1])
         elif self.verb in ("closed", "open"):
-            self._emit([self.place] if self.place is not None else self.things[-1:])
+            self._emit([self.place] if self.place is not None else self.objs[-1:])
         elif word == "both" and not preposition:
             return
         elif self.verb not in ("", "on", "state"):
-            self._emit(self.things)
+            self._emit(self.objs)
 
     def _opened(self) -> Mention | None:
-        return next((goal.thing for goal in reversed(self.found) if goal.kind == "open"), None)
+        return next((goal.obj for goal in reversed(self.found) if goal.kind == "open"), None)
 
-    def _emit(self, things: list[Mention]) -> None:
-        for thing in things:
-            tool = self.tool if self.verb in (*TOOLS, "filled") and self.tool != thing else None
-            self.found.append(Goal(self.verb, thing, None, tool))
+    def _emit(self, objs: list[Mention]) -> None:
+        for obj in objs:
+            tool = self.tool if self.verb in (*TOOLS, "filled") and self.tool != obj else None
+            self.found.append(Goal(self.verb, obj, None, tool))
 
     # ---- what is asked for, and what is only a means
 
     def _judged(self) -> tuple[Goal, ...]:
         goals = [replace(g, kind="lifted") if self.said.heavy and g.kind == "held" else g for g in self.found]
-        work = {g.thing for g in goals if g.kind in ("sliced", "clean", "cooked", "filled", "used_up")}
-        put = {g.thing for g in goals if g.kind == "on"}
-        places = {g.place for g in goals if g.kind == "on"} | {g.thing.place for g in goals}
-        filled = {g.thing for g in goals if g.kind == "filled"}
+        work = {g.obj for g in goals if g.kind in ("sliced", "clean", "cooked", "filled", "used_up")}
+        put = {g.obj for g in goals if g.kind == "on"}
+        places = {g.place for g in goals if g.kind == "on"} | {g.obj.place for g in goals}
+        filled = {g.obj for g in goals if g.kind == "filled"}
         tools = {g.tool for g in goals if g.tool is not None}
         kept: list[Goal] = []
         for goal in goals:
-            if goal.kind in ("held", "lifted") and (goal.thing in put | tools or (goal.thing in work)):
+            if goal.kind in ("held", "lifted") and (goal.obj in put | tools or (goal.obj in work)):
                 continue
-            if goal.kind == "held" and any(g.kind in TOOLS and goal.thing.name in TOOLS[g.kind] for g in goals):
-                goals = [replace(g, tool=goal.thing) if g.kind in TOOLS and g.tool is None else g for g in goals]
-                kept = [replace(g, tool=goal.thing) if g.kind in TOOLS and g.tool is None else g for g in kept]
+            if goal.kind == "held" and any(g.kind in TOOLS and goal.obj.name in TOOLS[g.kind] for g in goals):
+                goals = [replace(g, tool=goal.obj) if g.kind in TOOLS and g.tool is None else g for g in goals]
+                kept = [replace(g, tool=goal.obj) if g.kind in TOOLS and g.tool is None else g for g in kept]
                 continue
-            if goal.kind == "open" and goal.thing in places:
+            if goal.kind == "open" and goal.obj in places:
                 continue
-            if goal.kind == "on" and goal.thing in filled:
+            if goal.kind == "on" and goal.obj in filled:
                 kept = [replace(g, place=goal.place) if g.kind == "filled" and g.place is None else g for g in kept]
                 continue
             kept.append(goal)
         for goal in [g for g in kept if g.kind == "filled" and g.tool is not None and self.said.in_hands]:
             assert goal.tool is not None
-            kept += [Goal("held", goal.thing), Goal("held", goal.tool)]
-        kept += [Goal("on", g.thing, g.place) for g in kept if g.kind == "cooked" and g.place and g.thing not in put]
+            kept += [Goal("held", goal.obj), Goal("held", goal.tool)]
+        kept += [Goal("on", g.obj, g.place) for g in kept if g.kind == "cooked" and g.place and g.obj not in put]
         if self.said.level:
-            kept += [Goal("filled", g.thing) for g in kept if g.kind == "on"]
+            kept += [Goal("filled", g.obj) for g in kept if g.kind == "on"]
         if self.said.ajar:
             kept += self._falls_shut(kept)
         if not goals and self.verb == "on":  # bring it, to nowhere in particular
-            kept += [Goal("held", thing) for thing in self.things]
+            kept += [Goal("held", obj) for obj in self.objs]
         return tuple(dict.fromkeys(kept))
 
     def _falls_shut(self, goals: list[Goal]) -> list[Goal]:
         for goal in goals:
-            door = goal.place if goal.kind == "on" else self.said.door or goal.thing.place or self.place
+            door = goal.place if goal.kind == "on" else self.said.door or goal.obj.place or self.place
             if door is not None:
                 return [Goal("closed", door, ajar=True)]
         return []

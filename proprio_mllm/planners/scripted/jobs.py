@@ -46,16 +46,16 @@ class Want:
 
     Attributes:
         kind: as `Goal.kind`.
-        thing, place, tool: ids, None for what has not been seen.
-        spoken_thing, spoken_tool: what the instruction says of thing and tool.
+        obj, place, tool: ids, None for what has not been seen.
+        spoken_obj, spoken_tool: what the instruction says of thing and tool.
         source: where the thing is said to be.
     """
 
     kind: str
-    thing: str | None
+    obj: str | None
     place: str | None = None
     tool: str | None = None
-    spoken_thing: Mention | None = None
+    spoken_obj: Mention | None = None
     spoken_tool: Mention | None = None
     source: str | None = None
 
@@ -86,20 +86,20 @@ class Job:
 
 def holds(want: Want, belief: Belief) -> bool:
     """Whether a want is fulfilled, as far as one can know."""
-    thing = want.thing
-    if thing is None:
+    obj = want.obj
+    if obj is None:
         return False
     if want.kind == "held":
-        return belief.state.arm_with(thing) is not None and thing not in belief.state.in_place
+        return belief.state.arm_with(obj) is not None and obj not in belief.state.in_place
     if want.kind == "lifted":
-        return belief.state.lifted == thing
+        return belief.state.lifted == obj
     if want.kind == "on":
-        return want.place is not None and belief.state.at.get(thing) == want.place
+        return want.place is not None and belief.state.at.get(obj) == want.place
     if want.kind in ("open", "closed"):
-        return belief.state.is_in(Condition.OPEN, thing) is (want.kind == "open")
+        return belief.state.is_in(Condition.OPEN, obj) is (want.kind == "open")
     if want.kind in ("toggled_on", "toggled_off"):
-        return belief.state.is_in(Condition.ON, thing) is (want.kind == "toggled_on")
-    return belief.done(want.kind, thing)
+        return belief.state.is_in(Condition.ON, obj) is (want.kind == "toggled_on")
+    return belief.done(want.kind, obj)
 
 
 def next_jobs(wants: Sequence[Want], belief: Belief, known: Sequence[str]) -> list[Job]:
@@ -120,7 +120,7 @@ def next_jobs(wants: Sequence[Want], belief: Belief, known: Sequence[str]) -> li
     if work:
         return _with_free_hand(work, wants, belief)
     moves = [want for want in pending if want.kind == "on"]
-    light = [want for want in moves if not _is_heavy(want.thing, want.spoken_thing, belief)]
+    light = [want for want in moves if not _is_heavy(want.obj, want.spoken_obj, belief)]
     held = [want for want in pending if want.kind in ("held", "lifted")]
     jobs = [_change(want) for want in pending if want.kind in ("toggled_on", "toggled_off")]
     opening = [_change(want) for want in pending if want.kind == "open"]  # open doors are in the way: rather late
@@ -138,13 +138,13 @@ def next_jobs(wants: Sequence[Want], belief: Belief, known: Sequence[str]) -> li
 
 def _change(want: Want) -> Job:
     """Bringing about a state of a door or switch."""
-    return Job(_CHANGES[want.kind], want.thing, None, want.spoken_thing, want.source)
+    return Job(_CHANGES[want.kind], want.obj, None, want.spoken_obj, want.source)
 
 
-def _is_heavy(thing: str | None, spoken: Mention | None, belief: Belief) -> bool:
-    if thing in belief.heavy or thing in belief.light:
-        return thing in belief.heavy
-    name = type_of(thing) if thing is not None else "" if spoken is None else spoken.name
+def _is_heavy(obj: str | None, spoken: Mention | None, belief: Belief) -> bool:
+    if obj in belief.heavy or obj in belief.light:
+        return obj in belief.heavy
+    name = type_of(obj) if obj is not None else "" if spoken is None else spoken.name
     return name in _BIG
 
 
@@ -152,18 +152,18 @@ def _is_shut(place: str | None, belief: Belief) -> bool:
     return place is not None and not belief.state.conditions[Condition.OPEN].get(place, type_of(place) not in _SHUT)
 
 
-def _pick(thing: str | None, spoken: Mention | None, source: str | None, belief: Belief) -> Job:
+def _pick(obj: str | None, spoken: Mention | None, source: str | None, belief: Belief) -> Job:
     """Taking a thing, or the opening of what it is in."""
-    place = belief.state.at.get(thing or "", source)
+    place = belief.state.at.get(obj or "", source)
     if place is not None and _is_shut(place, belief) and ("Open", place) not in belief.never:
         return Job("Open", place)
-    return Job("Pick", thing, None, spoken, place)
+    return Job("Pick", obj, None, spoken, place)
 
 
 def _set_down(pending: Sequence[Want], belief: Belief) -> Job:
     lifted = belief.state.lifted
     for want in pending:
-        if want.kind == "on" and want.thing == lifted and want.place is not None:
+        if want.kind == "on" and want.obj == lifted and want.place is not None:
             return Job("PlaceBoth", want.place)
     return Job("PlaceBoth", belief.state.here if belief.state.here != lifted else None)
 
@@ -176,10 +176,10 @@ def _through_held_door(pending: Sequence[Want], belief: Belief) -> list[Job]:
     door = belief.state.held[arm]
     other = belief.state.held[arm.other]
     for want in pending:
-        if want.kind == "on" and want.place == door and want.thing == other and other is not None:
+        if want.kind == "on" and want.place == door and want.obj == other and other is not None:
             return [Job("Place", door, arm.other)]
         if want.kind in ("held", "on") and want.source == door and want.place != door and other is None:
-            return [Job("Pick", want.thing, arm.other, want.spoken_thing, door)]
+            return [Job("Pick", want.obj, arm.other, want.spoken_obj, door)]
     return [Job("Release", "", arm)]
 
 
@@ -189,14 +189,14 @@ def _work(want: Want, belief: Belief, known: Sequence[str]) -> list[Job]:
         arm = belief.state.arm_with(want.tool)
         if arm is None:
             return [_pick(want.tool, want.spoken_tool, None, belief)]
-        if want.thing in belief.unsteady and want.thing not in belief.state.in_place:
-            return [Job("Hold", want.thing, arm.other, want.spoken_thing)]
-        return [Job(_TOOL_VERBS[want.kind], want.thing, arm, want.spoken_thing, want.source)]
+        if want.obj in belief.unsteady and want.obj not in belief.state.in_place:
+            return [Job("Hold", want.obj, arm.other, want.spoken_obj)]
+        return [Job(_TOOL_VERBS[want.kind], want.obj, arm, want.spoken_obj, want.source)]
     if want.kind == "used_up":
-        return [Job("UseUp", want.thing, None, want.spoken_thing, want.source)]
+        return [Job("UseUp", want.obj, None, want.spoken_obj, want.source)]
     if want.kind == "filled":
         return _fill(want, belief, known)
-    if want.kind == "cooked" and want.place is not None and belief.state.at.get(want.thing or "") == want.place:
+    if want.kind == "cooked" and want.place is not None and belief.state.at.get(want.obj or "") == want.place:
         if belief.state.is_in(Condition.OPEN, want.place) is not False and type_of(want.place) in _SHUT:
             return [Job("Close", want.place)]
         return [Job("ResetArm", "", Arm.RIGHT) if belief.state.is_in(Condition.ON, want.place) else Job("ToggleOn", want.place)]
@@ -208,10 +208,10 @@ def _fill(want: Want, belief: Belief, known: Sequence[str]) -> list[Job]:
         arm = belief.state.arm_with(want.tool)
         if arm is None:
             return [_pick(want.tool, want.spoken_tool, None, belief)]
-        return [Job("Pour", want.thing, arm, want.spoken_thing, want.source)]
-    bearer = belief.state.arm_with(want.thing)
+        return [Job("Pour", want.obj, arm, want.spoken_obj, want.source)]
+    bearer = belief.state.arm_with(want.obj)
     if bearer is None:
-        return [_pick(want.thing, want.spoken_thing, want.source, belief)]
+        return [_pick(want.obj, want.spoken_obj, want.source, belief)]
     taps = [name for name in known if type_of(name) in ("faucet", "coffeemachine")]
     source = want.place or next(iter(taps), None)
     if source is None:
@@ -228,10 +228,10 @@ def _fill(want: Want, belief: Belief, known: Sequence[str]) -> list[Job]:
 
 def _carry(light: Sequence[Want], belief: Belief) -> list[Job]:
     """Carrying small things: the hands are filled first, but one stays free for a door that is still shut."""
-    in_hand = [want for want in light if belief.state.arm_with(want.thing) is not None]
+    in_hand = [want for want in light if belief.state.arm_with(want.obj) is not None]
     waiting = [want for want in light if want not in in_hand]
     if in_hand:  # what may be anywhere is not searched with full hands
-        waiting = [want for want in waiting if want.thing is not None or want.source is not None]
+        waiting = [want for want in waiting if want.obj is not None or want.source is not None]
     free = belief.state.free_arms()
     door_ahead = any(_is_shut(want.place, belief) for want in in_hand)
     if waiting and free and not door_ahead:
@@ -240,13 +240,13 @@ def _carry(light: Sequence[Want], belief: Belief) -> list[Job]:
         if ajar and not in_hand and len(waiting) > 1:
             return [Job("Open", ajar[0])]
         room = 1 if shut else len(free)
-        return list(dict.fromkeys(_pick(w.thing, w.spoken_thing, w.source, belief) for w in waiting))[:room]
+        return list(dict.fromkeys(_pick(w.obj, w.spoken_obj, w.source, belief) for w in waiting))[:room]
     jobs = []
     for want in in_hand:
         if _is_shut(want.place, belief) and free:
             jobs.append(Job("Open", want.place))
         else:
-            jobs.append(Job("Place", want.place, belief.state.arm_with(want.thing)))
+            jobs.append(Job("Place", want.place, belief.state.arm_with(want.obj)))
     return jobs
 
 
@@ -254,16 +254,16 @@ def _heavy(moves: Sequence[Want], belief: Belief) -> list[Job]:
     for want in moves:
         if _is_shut(want.place, belief):
             return [Job("Open", want.place)]
-        return [Job("Lift", want.thing, None, want.spoken_thing, want.source)]
+        return [Job("Lift", want.obj, None, want.spoken_obj, want.source)]
     return []
 
 
 def _hold(want: Want, belief: Belief) -> list[Job]:
-    if want.kind == "lifted" or _is_heavy(want.thing, want.spoken_thing, belief):
-        if want.thing in belief.light:
-            return [_pick(want.thing, want.spoken_thing, want.source, belief)]
-        return [Job("Lift", want.thing, None, want.spoken_thing, want.source)]
-    return [_pick(want.thing, want.spoken_thing, want.source, belief)]
+    if want.kind == "lifted" or _is_heavy(want.obj, want.spoken_obj, belief):
+        if want.obj in belief.light:
+            return [_pick(want.obj, want.spoken_obj, want.source, belief)]
+        return [Job("Lift", want.obj, None, want.spoken_obj, want.source)]
+    return [_pick(want.obj, want.spoken_obj, want.source, belief)]
 
 
 def _with_free_hand(jobs: list[Job], wants: Sequence[Want], belief: Belief) -> list[Job]:
@@ -279,13 +279,13 @@ def _with_free_hand(jobs: list[Job], wants: Sequence[Want], belief: Belief) -> l
     if (len(free) == 2) if both else (needed in free if needed is not None else bool(free)):
         return jobs
     tools = {want.tool for want in wants if want.tool is not None and not holds(want, belief)}
-    kept = {want.thing for want in wants if want.kind == "held"} | tools | {head.target}
+    kept = {want.obj for want in wants if want.kind == "held"} | tools | {head.target}
     arms = [arm for arm, item in belief.state.held.items() if item is not None and (needed is None or arm is needed)]
     arms.sort(key=lambda arm: belief.state.held[arm] in kept)
     for arm in arms:
         item = belief.state.held[arm]
         if item in belief.state.in_place or item in belief.state.self_closing:
             return [Job("Release", "", arm)]
-        spot = next((want.place for want in wants if want.kind == "on" and want.thing == item), None)
+        spot = next((want.place for want in wants if want.kind == "on" and want.obj == item), None)
         return [Job("Place", spot or belief.state.here, arm)]
     return jobs

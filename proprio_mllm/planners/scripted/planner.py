@@ -90,7 +90,7 @@ class ScriptedPlanner:
         if self._goals is None:
             self._goals = read_goals(observation.instruction, observation.known_objects)
         memory.look(observation)
-        doors = [memory.find(goal.thing) for goal in self._goals if goal.ajar]
+        doors = [memory.find(goal.obj) for goal in self._goals if goal.ajar]
         belief = memory.belief = Belief.of(observation.history, [door for door in doors if door is not None])
         jobs = next_jobs(self._wants(belief), belief, observation.known_objects)
         jobs = [job for job in jobs if not self._given_up(job, belief)]
@@ -115,20 +115,20 @@ class ScriptedPlanner:
         """The goals with ids; of several any, as many as are meant."""
         wants: list[Want] = []
         assert self._goals is not None
-        on = {goal.thing for goal in self._goals if goal.kind == "on"}
+        on = {goal.obj for goal in self._goals if goal.kind == "on"}
         for goal in self._goals:
-            if goal.kind == "filled" and goal.thing in on and goal.tool is None and goal.place is None:
+            if goal.kind == "filled" and goal.obj in on and goal.tool is None and goal.place is None:
                 continue  # it is full, and only has to stay so
             tool = goal.tool or (Mention(TOOLS[goal.kind][0]) if goal.kind in TOOLS else None)
             place = None if goal.place is None else self._memory.find(goal.place)
-            for index in range(goal.thing.count):
-                thing = self._memory.find(goal.thing, index)
-                source = None if goal.thing.place is None else self._memory.find(goal.thing.place)
+            for index in range(goal.obj.count):
+                obj = self._memory.find(goal.obj, index)
+                source = None if goal.obj.place is None else self._memory.find(goal.obj.place)
                 tool_id = None if tool is None else self._memory.find(tool)
-                wants.append(Want(goal.kind, thing, place, tool_id, goal.thing, tool, source))
+                wants.append(Want(goal.kind, obj, place, tool_id, goal.obj, tool, source))
                 if goal.place is not None and place is None:
                     wants[-1] = Want("held", None, None, None, goal.place, None, None)  # the place has to be found first
-        broken = [want for want in wants if want.thing in belief.broken]
+        broken = [want for want in wants if want.obj in belief.broken]
         return [want for want in wants if want not in broken]
 
     def _given_up(self, job: Job, belief: Belief) -> bool:

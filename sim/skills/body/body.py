@@ -102,18 +102,18 @@ class Body:
     def planning_state(self) -> tuple[object, ...]:
         """Everything that a plan depends on: positions, commands, states and holders of objects, the hypothesis."""
         data = self.world.data
-        things = tuple(
-            (dataclasses.astuple(thing.state), tuple(thing.held_by), thing.openness, thing.mass_kg)
-            for thing in self.world.objects.values()
+        objs = tuple(
+            (dataclasses.astuple(obj.state), tuple(obj.held_by), obj.openness, obj.mass_kg)
+            for obj in self.world.objects.values()
         )
         numbers = (data.qpos.tobytes(), data.ctrl.tobytes(), data.xpos.tobytes())
-        return *numbers, things, self.hypothesis
+        return *numbers, objs, self.hypothesis
 
     def fits(self, stance: Stance) -> bool:
         """Whether arms and hands, as they are commanded, would touch nothing at a stance."""
         there = self.assuming(stance=stance)
         return all(there.probe.free(arm, [self.arms.commanded(arm)]) for arm in Arm)
 
-    def thing(self, object_id: str) -> ObjectInstance:
+    def obj(self, object_id: str) -> ObjectInstance:
         """An object of the scene by id."""
         return self.world.objects[object_id]

@@ -137,10 +137,10 @@ class ClearanceProbe:
         """
         world, scratch, model = self._world, self._scratch, self._world.model
         allowed = {geom for geom in ignore if isinstance(geom, int)}
-        for name, thing in world.objects.items():
-            mine = arm.value in thing.held_by
-            if name in ignore or mine or (thing.held_by and thing.movable):  # what the other hand holds open is in the way
-                allowed.update(map(int, thing.geom_ids))
+        for name, obj in world.objects.items():
+            mine = arm.value in obj.held_by
+            if name in ignore or mine or (obj.held_by and obj.movable):  # what the other hand holds open is in the way
+                allowed.update(map(int, obj.geom_ids))
         self._copy_state()
         if opening is not None:
             self._shape_hand(arm, opening)
@@ -194,9 +194,9 @@ class ClearanceProbe:
         mujoco.mj_collision(model, scratch)
         barred = np.ones(model.ngeom, dtype=bool)
         barred[panel] = False
-        for thing in world.objects.values():
-            if thing.held_by:
-                barred[thing.geom_ids] = False
+        for obj in world.objects.values():
+            if obj.held_by:
+                barred[obj.geom_ids] = False
         touching = np.zeros(model.ngeom, dtype=bool)
         touching[limb] = True
         a, b = scratch.contact.geom[: scratch.ncon].T
@@ -210,30 +210,30 @@ class ClearanceProbe:
         """What the arm alone holds, as it lies in the hand now."""
         world = self._world
         name = world.grasps.held(arm.value)
-        thing = None if name is None else world.objects[name]
-        if thing is None or not thing.movable or len(thing.held_by) != 1:
+        obj = None if name is None else world.objects[name]
+        if obj is None or not obj.movable or len(obj.held_by) != 1:
             return None
         site = self._joints.grasp_sites[arm]
         rotation = world.data.site_xmat[site].reshape(3, 3)
-        offset = rotation.T @ (world.data.xpos[thing.body_id] - world.data.site_xpos[site])
-        turn = rotation.T @ world.data.xmat[thing.body_id].reshape(3, 3)
-        return _Cargo(site, thing.qpos_adr, offset, turn, frozenset(map(int, thing.geom_ids)))
+        offset = rotation.T @ (world.data.xpos[obj.body_id] - world.data.site_xpos[site])
+        turn = rotation.T @ world.data.xmat[obj.body_id].reshape(3, 3)
+        return _Cargo(site, obj.qpos_adr, offset, turn, frozenset(map(int, obj.geom_ids)))
 
     def free(self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str | int] = (), opening: float | None = None) -> bool:
         """Whether some arm postures at most touch what is around."""
         return bool(np.all(self.depths_m(arm, postures, ignore, opening, limit_m=TOUCH_M) <= TOUCH_M))
 
-    def load_depths_m(self, thing: ObjectInstance, poses: Iterable[Array]) -> Array:
+    def load_depths_m(self, obj: ObjectInstance, poses: Iterable[Array]) -> Array:
         """How deep a held object is in what is around at each of its poses (4, 4), world frame.
 
         The robot and what lies in the object do not count.
         """
         world, scratch, model = self._world, self._scratch, self._world.model
         scratch.qpos[:] = world.data.qpos
-        place, turn = slice(thing.qpos_adr, thing.qpos_adr + 3), slice(thing.qpos_adr + 3, thing.qpos_adr + 7)
-        load = np.isin(np.arange(model.ngeom), thing.geom_ids)
+        place, turn = slice(obj.qpos_adr, obj.qpos_adr + 3), slice(obj.qpos_adr + 3, obj.qpos_adr + 7)
+        load = np.isin(np.arange(model.ngeom), obj.geom_ids)
         barred = ~np.isin(model.geom_bodyid, list(world.scene.robot_bodies))
-        for name in (thing.object_id, *world.containment.contents(thing.object_id)):
+        for name in (obj.object_id, *world.containment.contents(obj.object_id)):
             barred[world.objects[name].geom_ids] = False
         depths: list[float] = []
         for pose in poses:

@@ -43,9 +43,9 @@ class Contacts:
         off = max(float(np.max(np.abs(data.qpos[measured[arm]] - data.ctrl[told[arm]]))) for arm in Arm)
         return np.array([depth_m, bent, off if touches else 0.0])
 
-    def rests(self, thing: ObjectInstance) -> bool:
+    def rests(self, obj: ObjectInstance) -> bool:
         """Whether an object touches something that is not part of the robot, from above."""
-        data, mine = self._world.data, set(map(int, thing.geom_ids))
+        data, mine = self._world.data, set(map(int, obj.geom_ids))
         owner = self._world.scene.object_of_geom
         for contact in data.contact[: data.ncon]:
             a, b = int(contact.geom1), int(contact.geom2)
@@ -66,7 +66,7 @@ class Contacts:
     def _contact_owner(self) -> NDArray[np.int64]:
         """(ngeom,) 1 for the robot's geoms, 0 for those of what it holds, -1 for all others."""
         owner = self._mine.copy()
-        for thing in self._world.objects.values():
-            if thing.held_by:
-                owner[thing.geom_ids] = 0
+        for obj in self._world.objects.values():
+            if obj.held_by:
+                owner[obj.geom_ids] = 0
         return owner

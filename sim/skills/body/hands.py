@@ -31,15 +31,15 @@ class Hands:
     def held(self) -> dict[Arm, str | None]:
         """What each hand holds."""
         found: dict[Arm, str | None] = dict.fromkeys(Arm)
-        for name, thing in self._world.objects.items():
-            for arm in thing.held_by:
+        for name, obj in self._world.objects.items():
+            for arm in obj.held_by:
                 found[Arm(arm)] = name
         return found
 
     @property
     def lifted(self) -> str | None:
         """The object that both hands hold together."""
-        return next((name for name, thing in self._world.objects.items() if len(thing.held_by) == 2), None)
+        return next((name for name, obj in self._world.objects.items() if len(obj.held_by) == 2), None)
 
     def at_furniture(self, arm: Arm | None = None) -> bool:
         """Whether a hand, any or the given one, is at a door or drawer, which a body on the move would tear at."""

@@ -42,8 +42,8 @@ class ArmGoal:
 
     Attributes:
         q: (A,) arm joints.
-        error_m: distance of the grasp site from the wish.
-        pointing_cos, closing_cos: how well the hand's axes agree with the wish, 1 where it left them open.
+        error_m: distance of the grasp site from the target.
+        pointing_cos, closing_cos: how well the hand's axes agree with the target, 1 where it left them open.
         pointing, closing: (3,) directions that the hand has then, world frame.
     """
 
@@ -62,8 +62,8 @@ class BothGoal:
     Attributes:
         arms: (A,) joints per arm.
         waist: waist joints.
-        error_m: largest distance of a grasp site from its wish.
-        tilt_rad: largest angle between a wished and a reached pointing direction.
+        error_m: largest distance of a grasp site from its target.
+        tilt_rad: largest angle between a pointing direction that is asked for and the one reached direction.
     """
 
     arms: Mapping[Arm, Array]
@@ -95,7 +95,7 @@ class InverseKinematics:
     def solve(
         self,
         arm: Arm,
-        wish: HandPose,
+        hand_target: HandPose,
         start: Array | None = None,
         pelvis_height_m: float | None = None,
         base: Stance | None = None,
@@ -104,11 +104,11 @@ class InverseKinematics:
     ) -> ArmGoal:
         """Solves one arm for a hand pose given in the world, waist straight, the other arm where it is told to be.
 
-        An arm that is wound up or inside the robot's own body counts as far from its wish.
+        An arm that is wound up or inside the robot's own body counts as far from its target.
 
         Args:
             arm: which one.
-            wish: the hand pose, position and directions in the world frame.
+            hand_target: the hand pose, position and directions in the world frame.
             start: (A,) joints to start from; the best postures of the reach map when None.
             pelvis_height_m: pelvis height to solve for, the commanded one by default.
             base: base pose to solve for, the commanded one by default.
@@ -117,7 +117,7 @@ class InverseKinematics:
         """
         height = self._posture.pelvis_height_m if pelvis_height_m is None else pelvis_height_m
         lean = self._posture.lean(height)
-        local = self._posture.wish_in_pelvis(wish, height, base)
+        local = self._posture.target_in_pelvis(hand_target, height, base)
         reach_map = self.maps[arm.value]
         starts: Sequence[Array]
         if start is None:
@@ -173,21 +173,21 @@ class InverseKinematics:
         assert best is not None
         return best[1]
 
-    def solve_both(self, wishes: Mapping[Arm, HandPose], start: Mapping[Arm, Array] | None = None) -> BothGoal:
+    def solve_both(self, hand_targets: Mapping[Arm, HandPose], start: Mapping[Arm, Array] | None = None) -> BothGoal:
         """Solves both arms as one problem with the robot's own solver.
 
         Args:
-            wishes: world hand poses; pointing and closing must be given.
+            hand_targets: world hand poses; pointing and closing must be given.
             start: (A,) joints per arm to start from; the best postures of the reach maps when None.
         """
         height = self._posture.pelvis_height_m
         lean = self._posture.lean(height)
         q = self._commanded_joints()
         targets: dict[str, ReachTarget] = {}
-        for arm, wish in wishes.items():
-            local = self._posture.wish_in_pelvis(wish, height)
+        for arm, hand_target in hand_targets.items():
+            local = self._posture.target_in_pelvis(hand_target, height)
             if local.pointing is None or local.closing is None:
-                raise ValueError(f"both directions of the {arm} hand must be given, got {wish}")
+                raise ValueError(f"both directions of the {arm} hand must be given, got {hand_target}")
             rotation = local.rotation(local.pointing, local.closing)
             targets[arm.value] = ReachTarget(local.position, rotation, 0.15, 0.08)
             upright = HandPose(lean.T @ local.position, lean.T @ local.pointing, lean.T @ local.closing)

@@ -21,30 +21,30 @@ class ObjectGeometry:
 
     def center(self, object_id: str) -> Array:
         """(3,) centre of an object's bounding box in the world."""
-        thing = self._world.objects[object_id]
-        rotation = self._world.data.xmat[thing.body_id].reshape(3, 3)
-        return self._world.data.xpos[thing.body_id] + rotation @ (0.5 * (thing.local_min + thing.local_max))
+        obj = self._world.objects[object_id]
+        rotation = self._world.data.xmat[obj.body_id].reshape(3, 3)
+        return self._world.data.xpos[obj.body_id] + rotation @ (0.5 * (obj.local_min + obj.local_max))
 
     def interaction_point(self, object_id: str) -> Array:
         """(3,) world point that a robot who goes to an object wants before it: handle, inside, switch or centre."""
-        thing = self._world.objects[object_id]
-        if thing.movable and thing.type.lidded:  # to lift it as well as to open it
+        obj = self._world.objects[object_id]
+        if obj.movable and obj.type.lidded:  # to lift it as well as to open it
             return self.center(object_id)
-        if thing.is_shut and thing.moving[0].handle_site >= 0:
-            return self._world.data.site_xpos[thing.moving[0].handle_site].copy()
-        if thing.type.encloses:
-            surface = thing.surfaces[0]
+        if obj.is_shut and obj.moving[0].handle_site >= 0:
+            return self._world.data.site_xpos[obj.moving[0].handle_site].copy()
+        if obj.type.encloses:
+            surface = obj.surfaces[0]
             local = np.array([surface.spec.rect[0], surface.spec.rect[1], surface.spec.z]) - surface.origin
             return self._world.data.xpos[surface.body_id] + self._world.data.xmat[surface.body_id].reshape(3, 3) @ local
-        if thing.toggle_site >= 0 and not thing.type.pickupable:
-            return self._world.data.site_xpos[thing.toggle_site].copy()
+        if obj.toggle_site >= 0 and not obj.type.pickupable:
+            return self._world.data.site_xpos[obj.toggle_site].copy()
         return self.center(object_id)
 
     def faces_rad(self, object_id: str) -> tuple[float, ...]:
         """World directions out of an object in which a robot stands well: square to what carries it, or to its own sides."""
-        thing = self._world.objects[object_id]
-        square = thing
-        if thing.movable and not self._world.containment.needs_two_hands(object_id):
+        obj = self._world.objects[object_id]
+        square = obj
+        if obj.movable and not self._world.containment.needs_two_hands(object_id):
             carriers = self._world.containment.parents(object_id)
             if not carriers:
                 return ()
@@ -55,12 +55,12 @@ class ObjectGeometry:
         sides = square.movable or any(surface.spec.all_sides for surface in square.surfaces)
         return tuple(angle + k * np.pi / 2.0 for k in range(4)) if sides else (angle,)
 
-    def solid_geoms(self, thing: ObjectInstance) -> NDArray[np.int64]:
+    def solid_geoms(self, obj: ObjectInstance) -> NDArray[np.int64]:
         """Geoms of an object that take part in contacts."""
-        return thing.geom_ids[self._world.model.geom_contype[thing.geom_ids] > 0]
+        return obj.geom_ids[self._world.model.geom_contype[obj.geom_ids] > 0]
 
-    def part_geoms(self, thing: ObjectInstance, option: str) -> NDArray[np.int64]:
+    def part_geoms(self, obj: ObjectInstance, option: str) -> NDArray[np.int64]:
         """Geoms of an object's parts with a catalogue option, such as `handle` or `toggle`."""
         return np.array(
-            [geom for geom, part in self._world.scene.part_of_geom[thing.object_id] if option in part.options], dtype=np.int64
+            [geom for geom, part in self._world.scene.part_of_geom[obj.object_id] if option in part.options], dtype=np.int64
         )

@@ -57,12 +57,12 @@ class Posture:
         height = self.pelvis_height_m if pelvis_height_m is None else pelvis_height_m
         return self.turn_to_pelvis(np.asarray(point, dtype=float) - (base.x, base.y, height), base)
 
-    def wish_in_pelvis(self, wish: HandPose, pelvis_height_m: float, base: Stance | None = None) -> HandPose:
+    def target_in_pelvis(self, hand_target: HandPose, pelvis_height_m: float, base: Stance | None = None) -> HandPose:
         return HandPose(
-            self.to_pelvis(wish.position, pelvis_height_m, base),
-            None if wish.pointing is None else self.turn_to_pelvis(wish.pointing, base),
-            None if wish.closing is None else self.turn_to_pelvis(wish.closing, base),
-            wish.either_way,
+            self.to_pelvis(hand_target.position, pelvis_height_m, base),
+            None if hand_target.pointing is None else self.turn_to_pelvis(hand_target.pointing, base),
+            None if hand_target.closing is None else self.turn_to_pelvis(hand_target.closing, base),
+            hand_target.either_way,
         )
 
     def turn_to_pelvis(self, direction: Array, base: Stance | None = None) -> Array:

@@ -39,17 +39,17 @@ def ready_posture(kit: RobotKit, arm: Arm, raised: bool = False) -> Array:
     ahead = min(0.3 * reach_map.reach_m, kit.spec.footprint_radius_m - 0.06)  # the disc that navigation keeps free
     drop = _LOW_CARRY_DROP if raised else _LOW_READY_DROP if _low_shoulders(kit) else _READY_DROP
     point = np.array([ahead, reach_map.shoulder[1], reach_map.shoulder[2] - drop * reach_map.reach_m])
-    wish = HandPose(point, np.array([1.0, 0.0, 0.0]), inward)
+    hand_target = HandPose(point, np.array([1.0, 0.0, 0.0]), inward)
     solver = PerArmSolver(kit.model, kit.crouches)
     columns = kit.model.indices(kit.spec.arms[arm.value].joints)
     site = (kit.spec.arms[arm.value].grasp_site,)
     root = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    rotation = wish.rotation(wish.pointing, inward) if wish.pointing is not None else np.eye(3)
+    rotation = hand_target.rotation(hand_target.pointing, inward) if hand_target.pointing is not None else np.eye(3)
     height = kit.spec.standing_pelvis_height_m
     elbow = kit.spec.key_bodies[f"{arm.value}_elbow"]
     tip_m = kit.spec.hand.tip_m
     best: tuple[float, Array] | None = None
-    for start in reach_map.starts(wish, 60, radius_m=0.15, near=np.array(kit.spec.arms[arm.value].carry)):
+    for start in reach_map.starts(hand_target, 60, radius_m=0.15, near=np.array(kit.spec.arms[arm.value].carry)):
         q = kit.model.posture()
         q[columns] = start
         target = ReachTarget(point, rotation, 0.3, 0.2)

@@ -40,13 +40,13 @@ class Workspace:
         reach, leaning = reach_maps(self._kit)["left"].reach_m, self._leaning_m()
         return 0.55 * reach + leaning, 0.8 * reach + leaning
 
-    def free_spots(self, thing: ObjectInstance, receptacle: ObjectInstance, arm: Arm | None, count: int = 4) -> list[Array]:
+    def free_spots(self, obj: ObjectInstance, receptacle: ObjectInstance, arm: Arm | None, count: int = 4) -> list[Array]:
         """Free spots (3,) on a receptacle for an object, the ones the arm reaches most easily first."""
         easy = self._easy_point(arm)
         spots: list[Array] = []
         # What two hands carry is held with its long side across: its narrow side may stand a little over the edge.
-        narrow = 0.5 * OVERHANG_SHARE * float(np.min(thing.local_max[:2] - thing.local_min[:2]))
-        radius = thing.footprint_radius_m if arm is not None else narrow
+        narrow = 0.5 * OVERHANG_SHARE * float(np.min(obj.local_max[:2] - obj.local_min[:2]))
+        radius = obj.footprint_radius_m if arm is not None else narrow
         for gap in (0.04, 0.01):
             for dx, dy in (
                 (0.0, 0.0),
@@ -60,8 +60,8 @@ class Workspace:
             ):
                 near = easy[:2] + self._posture.turn_to_world(np.array([dx, dy, 0.0]))[:2]
                 spot = self._world.containment.free_spot(
-                    receptacle.object_id, radius, height_m=thing.height_m, near=near, gap_m=gap,
-                    ignore=(thing.object_id,), band_m=10.0,
+                    receptacle.object_id, radius, height_m=obj.height_m, near=near, gap_m=gap,
+                    ignore=(obj.object_id,), band_m=10.0,
                 )  # fmt: skip
                 if spot is not None and all(float(np.linalg.norm(spot - known)) > 0.03 for known in spots):
                     spots.append(spot)

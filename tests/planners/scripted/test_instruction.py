@@ -87,7 +87,7 @@ def resolved(goals: Sequence[Goal], ids: Sequence[str]) -> set[Wanted]:
     def one(mention: Mention) -> str:
         return next(iter(candidates(mention, ids)), f"?{mention.name}")
 
-    return {(g.kind, one(g.thing), *((one(g.place),) if g.kind == "on" and g.place else ())) for g in goals}
+    return {(g.kind, one(g.obj), *((one(g.place),) if g.kind == "on" and g.place else ())) for g in goals}
 
 
 def sentences(family: str) -> Iterator[tuple[str, dict[str, str]]]:
@@ -130,7 +130,7 @@ def reads_right(task: Task, sentence: str) -> bool:
 
     def fits(goal: Goal, want: Wanted) -> bool:
         place = want[2:] == () or (goal.place is not None and want[2] in candidates(goal.place, ids))
-        return goal.kind == want[0] and want[1] in candidates(goal.thing, ids) and place
+        return goal.kind == want[0] and want[1] in candidates(goal.obj, ids) and place
 
     return all(any(fits(goal, want) for goal in goals) for want in wanted)
 
@@ -199,13 +199,13 @@ def test_other_sentences(sentence: str, wanted: set[Wanted]) -> None:
 
 def test_where_how_many_and_with_what() -> None:
     (goal,) = read_goals("Fetch the second mug from the first side table and put it in the fridge.")
-    assert goal.thing == Mention("mug", 2, place=Mention("sidetable", 1))
+    assert goal.obj == Mention("mug", 2, place=Mention("sidetable", 1))
     (goal,) = read_goals("Bring two butter knives to the desk.")
-    assert (goal.thing.name, goal.thing.count, goal.thing.definite) == ("butterknife", 2, False)
+    assert (goal.obj.name, goal.obj.count, goal.obj.definite) == ("butterknife", 2, False)
     (goal,) = read_goals("Slice the bread with the knife.")
     assert goal.tool == Mention("knife")
     (goal,) = read_goals("Polish it, then pick up the strange gadget from the desk.", ["StrangeGadget_3"])
-    assert candidates(goal.thing, ["StrangeGadget_3", "Gadget_1"]) == ["StrangeGadget_3"]
+    assert candidates(goal.obj, ["StrangeGadget_3", "Gadget_1"]) == ["StrangeGadget_3"]
 
 
 def test_marks_in_the_text_are_no_things() -> None:

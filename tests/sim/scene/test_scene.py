@@ -109,8 +109,8 @@ def test_bad_rooms_are_refused() -> None:
 
 def test_box_follows_the_body() -> None:
     world = World(None, "kitchen_1", [])
-    thing = index_object(world.model, "Cabinet_1", load_catalogue())
-    low, high = box_in_world(world.data, thing)
+    obj = index_object(world.model, "Cabinet_1", load_catalogue())
+    low, high = box_in_world(world.data, obj)
     assert (high - low)[1] == pytest.approx(0.47, abs=0.02)  # turned by 90 degrees
 
 

@@ -34,10 +34,10 @@ def start(session, openness):
 
 def test_the_front_of_a_drawer_is_where_its_geometry_says(session):
     body = start(session, 0.5)
-    part = body.thing(NAME).moving[0]
+    part = body.obj(NAME).moving[0]
     model, data = session.world.model, session.world.data
     panel = next(geom for geom in np.flatnonzero(model.geom_bodyid == part.body_id) if model.geom_aabb[geom, 5] > 0.07)
-    door = Door.of(body, body.thing(NAME), part)
+    door = Door.of(body, body.obj(NAME), part)
     assert door.slides and door.now == pytest.approx(0.13, abs=2e-3)
     middle = data.geom_xpos[panel]
     face = door.point(door.now, 0.5 * door.width_m, float(middle[2]))

@@ -24,10 +24,10 @@ def alone(name, openness):
     """A type alone on a floor with its lid somewhere."""
     model = build_type_spec(name).compile()
     data = mujoco.MjData(model)
-    thing = index_object(model, f"{name}_1", load_catalogue())
-    data.qpos[thing.moving[0].qpos_adr] = openness * thing.moving[0].range[1]
+    obj = index_object(model, f"{name}_1", load_catalogue())
+    data.qpos[obj.moving[0].qpos_adr] = openness * obj.moving[0].range[1]
     mujoco.mj_forward(model, data)
-    return model, data, thing
+    return model, data, obj
 
 
 def entry(world, name):
@@ -64,31 +64,31 @@ def test_every_openable_type_has_something_that_moves():
 @pytest.mark.parametrize("name", LIDDED)
 @pytest.mark.parametrize("openness", [0.0, 0.25, 0.5, 1.0])
 def test_a_lid_stays_where_it_is_left(name, openness):
-    model, data, thing = alone(name, openness)
-    part = thing.moving[0]
+    model, data, obj = alone(name, openness)
+    part = obj.moving[0]
     before = data.qpos[part.qpos_adr]
     mujoco.mj_step(model, data, round(5.0 / model.opt.timestep))
     assert data.qpos[part.qpos_adr] == pytest.approx(before, abs=0.08)
-    assert data.xmat[thing.body_id].reshape(3, 3)[2, 2] > 0.999  # an open one does not tip its object over
+    assert data.xmat[obj.body_id].reshape(3, 3)[2, 2] > 0.999  # an open one does not tip its object over
 
 
 @pytest.mark.parametrize("name", LIDDED)
 def test_a_lid_is_a_share_of_its_object(name):
-    kind, (model, data, thing) = load_catalogue().get(name), alone(name, 0.0)
-    lid = float(model.body_mass[thing.moving[0].body_id])
+    kind, (model, data, obj) = load_catalogue().get(name), alone(name, 0.0)
+    lid = float(model.body_mass[obj.moving[0].body_id])
     if kind.movable:
-        assert thing.mass_kg == pytest.approx(kind.mass) and 0.0 < lid < 0.25 * thing.mass_kg
-    closed = np.concatenate([thing.local_min, thing.local_max])
+        assert obj.mass_kg == pytest.approx(kind.mass) and 0.0 < lid < 0.25 * obj.mass_kg
+    closed = np.concatenate([obj.local_min, obj.local_max])
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for geom in thing.geom_ids:
+    for geom in obj.geom_ids:
         center = data.geom_xpos[geom] + data.geom_xmat[geom].reshape(3, 3) @ model.geom_aabb[geom, :3]
         half = np.abs(data.geom_xmat[geom].reshape(3, 3)) @ model.geom_aabb[geom, 3:]
         low, high = np.minimum(low, center - half), np.maximum(high, center + half)
     assert np.concatenate([low, high]) == pytest.approx(closed, abs=1e-6)
     if name == "Laptop":
-        assert thing.height_m == pytest.approx(0.03, abs=0.001)
+        assert obj.height_m == pytest.approx(0.03, abs=0.001)
         _, data, _ = alone(name, 1.55 / 1.9)
-        assert data.site_xpos[thing.moving[0].handle_site][2] == pytest.approx(0.3, abs=0.01)
+        assert data.site_xpos[obj.moving[0].handle_site][2] == pytest.approx(0.3, abs=0.01)
 
 
 @pytest.fixture(scope="module")

@@ -98,7 +98,7 @@ def stands_as_before(session, before):
 
 
 def places(session, door):
-    others = (name for name, thing in session.world.objects.items() if thing.movable and name != door)
+    others = (name for name, obj in session.world.objects.items() if obj.movable and name != door)
     return {name: session.body.objects.center(name) for name in others}
 
 

@@ -26,10 +26,10 @@ def test_built_type_has_its_measured_size_and_mass(name: str) -> None:
     catalogue = load_catalogue()
     kind = catalogue.get(name)
     model = build_type_spec(name).compile()
-    thing = index_object(model, f"{name}_1", catalogue)
-    size = thing.local_max - thing.local_min
+    obj = index_object(model, f"{name}_1", catalogue)
+    size = obj.local_max - obj.local_min
     if name == "CounterTop":  # measured without the cupboard below it
-        assert thing.local_max[2] == pytest.approx(0.90)
+        assert obj.local_max[2] == pytest.approx(0.90)
         size[2] = kind.size[2]
     if name == "Shelf":  # measured as a storage volume above its board
         assert size[2] == pytest.approx(kind.size[2], abs=0.01)
@@ -40,11 +40,11 @@ def test_built_type_has_its_measured_size_and_mass(name: str) -> None:
     assert np.all(size <= np.asarray(kind.size) * 1.12 + 0.025), size
     assert np.all(size >= np.asarray(kind.size) * 0.6 - 0.02), size
     if kind.movable:
-        assert thing.mass_kg == pytest.approx(kind.mass, rel=1e-6)
-        assert thing.movable
-    assert kind.receptacle == bool(thing.surfaces)
-    assert kind.toggleable == (thing.toggle_site >= 0)
-    for part in thing.moving:
+        assert obj.mass_kg == pytest.approx(kind.mass, rel=1e-6)
+        assert obj.movable
+    assert kind.receptacle == bool(obj.surfaces)
+    assert kind.toggleable == (obj.toggle_site >= 0)
+    for part in obj.moving:
         assert part.handle_site >= 0
 
 

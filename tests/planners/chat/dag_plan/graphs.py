@@ -46,11 +46,11 @@ def reply(*nodes: NodeReply, **fields: str) -> str:
     return json.dumps({"reasoning": "because"} | fields | {"nodes": [one.model_dump() for one in nodes]})
 
 
-def carried(thing: str, source: str, target: str, tag: str = "") -> tuple[NodeReply, NodeReply]:
+def carried(obj: str, source: str, target: str, tag: str = "") -> tuple[NodeReply, NodeReply]:
     """A thing is taken from one place to another."""
-    tag = tag or thing[0].lower()
-    taken = node(f"take_{tag}", f"Pick({thing})", at=source)
-    return taken, node(f"put_{tag}", f"Place({target})", taken.id, item=thing)
+    tag = tag or obj[0].lower()
+    taken = node(f"take_{tag}", f"Pick({obj})", at=source)
+    return taken, node(f"put_{tag}", f"Place({target})", taken.id, item=obj)
 
 
 def rollout(one: Graph, parallel: bool = True, hands: Hands = EMPTY, **situation: Any) -> list[str | tuple[Job, ...]]:

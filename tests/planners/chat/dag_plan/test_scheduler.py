@@ -228,13 +228,13 @@ def plans(draw: st.DrawFn) -> list[NodeReply]:
     held: dict[str, str] = {}  # item to the node that took it
     uses_of: dict[str, list[str]] = {}
     anchor: str | None = None
-    things = list(THINGS)
+    objs = list(THINGS)
     for number in range(draw(st.integers(1, 9))):
         name = f"n{number}"
         two = any(item == "Pot_1" for item in held)
         free = 0 if two else 2 - len(held)
         moves = ["body"] if anchor is None else []
-        moves += ["operate"] * bool(free) + ["take"] * bool(free and things) + ["use", "put"] * bool(held)
+        moves += ["operate"] * bool(free) + ["take"] * bool(free and objs) + ["use", "put"] * bool(held)
         move = draw(st.sampled_from(moves or ["put"]))
         place = draw(st.sampled_from(FURNITURE))
         waits = [one.id for one in nodes if draw(st.integers(0, 3)) == 0]
@@ -257,20 +257,20 @@ def plans(draw: st.DrawFn) -> list[NodeReply]:
             nodes.append(node(name, text, " ".join([*waits, held.pop(item), *uses_of.pop(item)]), item=item))
             anchor = None if item == anchor else anchor
         else:
-            thing = draw(st.sampled_from(things))
-            if thing == "Pot_1" and free < 2:
-                thing = next(one for one in things if one != "Pot_1") if len(things) > 1 else ""
-            if not thing:
+            obj = draw(st.sampled_from(objs))
+            if obj == "Pot_1" and free < 2:
+                obj = next(one for one in objs if one != "Pot_1") if len(objs) > 1 else ""
+            if not obj:
                 continue
-            things.remove(thing)
-            door = anchor is None and thing == "Book_1"
+            objs.remove(obj)
+            door = anchor is None and obj == "Book_1"
             if door:
                 nodes.append(node(name, "Open(Drawer_1)", " ".join(waits), type="occupy"))
-                thing = anchor = "Drawer_1"
+                obj = anchor = "Drawer_1"
             else:
-                verb = "Lift" if thing == "Pot_1" else "Pick"
-                nodes.append(node(name, f"{verb}({thing})", " ".join(waits), at=place))
-            held[thing], uses_of[thing] = name, []
+                verb = "Lift" if obj == "Pot_1" else "Pick"
+                nodes.append(node(name, f"{verb}({obj})", " ".join(waits), at=place))
+            held[obj], uses_of[obj] = name, []
     if held:
         nodes.append(node("end", "Done()", " ".join(held.values())))
     return nodes
