@@ -1,8 +1,8 @@
 """What a run's calls cost, and a cap that they hold to, over all threads and processes of the run.
 
-Before a call the most that it can cost is booked; afterwards its cost takes the place of the booking. A call whose booking would
-pass the cap is not made, so the sum of bookings is never less than what was spent, with one exception: attempts that the OpenAI
-client repeats by itself after a time-out may be charged too, and a call is booked once.
+Before a call the most that it can cost is booked; afterwards its cost takes the place of the booking. A call whose booking
+would pass the cap is not made, so the sum of bookings is never less than what was spent, with one exception: attempts that the
+OpenAI client repeats by itself after a time-out may be charged too, and a call is booked once.
 
 What becomes of a booking:
 
