@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
+from urllib.parse import urlsplit
 
 from configs.schema.checks import require, require_used
 
@@ -93,3 +95,12 @@ class BackendConfig:
         require(0.0 <= self.temperature <= 2.0, f"temperature {self.temperature} outside [0, 2]")
         require(32 <= self.image_size <= 2048, f"image_size {self.image_size} outside [32, 2048]")
         require(1 <= self.batch <= 1024, f"batch {self.batch} outside [1, 1024]")
+
+    @property
+    def on_this_machine(self) -> bool:
+        """Whether `base_url` names a server of this machine."""
+        try:
+            host = urlsplit(self.base_url or "").hostname or ""
+            return host == "localhost" or ipaddress.ip_address(host).is_loopback
+        except ValueError:
+            return False

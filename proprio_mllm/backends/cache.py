@@ -1,7 +1,13 @@
 """Backends that answer from recorded replies: one that asks another when there is none, and one that asks nobody.
 
-`python -m proprio_mllm report replies FILE` shows what was recorded. Errors and replies that were cut off
-are never recorded. Paper: none (engineering).
+    python -m proprio_mllm report replies FILE [show=KEY] [export=FILE.jsonl] [import=FILE.jsonl]
+
+    FILE                what backend.cache names, such as outputs/replies.sqlite; alone: a line per call
+    show=KEY            one call in full; the first digits of its key do
+    export=FILE.jsonl   all calls as JSON lines: version, key, purpose, recorded_at, question, reply; pictures are digests
+    import=FILE.jsonl   takes such lines in, all or none; calls that are there already stay as they are
+
+Errors and replies that were cut off are never recorded. Paper: none (engineering).
 """
 
 from __future__ import annotations
@@ -10,20 +16,28 @@ import contextlib
 import dataclasses
 import json
 import logging
+import os
+import sys
 import threading
-from collections.abc import Iterator
+import weakref
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+from rich.console import Console
+
+from configs.help import shows_help
 from configs.schema.backend import BackendConfig
-from proprio_mllm.backends.identity import identity_in_words, identity_of
+from data.files import write_text
+from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import Backend, BackendError, BackendSetupError, ChatReply, ChatRequest
-from proprio_mllm.backends.replies import ReplyStore, question_of
+from proprio_mllm.backends.replies import RecordedCall, ReplyStore, question_of
 
-__all__ = ["CachedBackend", "ReplayBackend", "recorded_revision"]
+__all__ = ["CachedBackend", "ReplayBackend", "main", "recorded_revision"]
 
+_VERSION: Final = 1
+_USAGE: Final = "expected FILE [show=KEY] [export=FILE.jsonl] [import=FILE.jsonl]"
 _SHOWN_CHARACTERS: Final = 80
-_SHOWN_OTHERS: Final = 5
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +60,9 @@ class CachedBackend:
         self.identity = inner.identity
         self._inner = inner
         self._store = ReplyStore(path)
-        self._turns = _Turns()
+        self._guard = threading.Lock()
+        #: One lock per question under way; it goes when nobody holds it or waits for it.
+        self._asking: weakref.WeakValueDictionary[str, threading.Lock] = weakref.WeakValueDictionary()
 
     def complete(self, request: ChatRequest) -> ChatReply:
         """The recorded reply, or a new one.
@@ -55,10 +71,9 @@ class CachedBackend:
             BackendError: as of `inner`, and when the file cannot be read.
         """
         key, question = question_of(self.identity, request)
-        found = self._store.get(key)
-        if found is not None:
-            return found
-        with self._turns.at(key):
+        with self._guard:
+            lock = self._asking.setdefault(key, threading.Lock())
+        with lock:
             found = self._store.get(key)
             if found is not None:
                 return found
@@ -82,27 +97,6 @@ class CachedBackend:
         return dataclasses.replace(reply, text=first.text, finish_reason=first.finish_reason, model=first.model)
 
 
-def recorded_revision(cfg: BackendConfig, path: Path) -> str:
-    """Revision of the newest recorded replies of a backend whose revision is not known; "" when there are none.
-
-    Raises:
-        BackendSetupError: when the file cannot be used.
-    """
-    if not path.is_file():
-        return ""
-    store = ReplyStore(path, read_only=True)
-    try:
-        held = store.identities()
-    finally:
-        store.close()
-    for identity in held:
-        with contextlib.suppress(ValueError, AttributeError):
-            revision = str(json.loads(identity).get("revision", ""))
-            if identity == identity_of(dataclasses.replace(cfg, revision=revision)):
-                return revision
-    return ""
-
-
 class ReplayBackend:
     """Answers from recorded replies alone.
 
@@ -123,46 +117,122 @@ class ReplayBackend:
 
         Raises:
             BackendError: when there is none; the message names the request.
-            BackendSetupError: when there is none to any request of this backend.
+            BackendSetupError: when there is none to any request of this backend; the message names those that there are.
         """
         key, _ = question_of(self.identity, request)
         found = self._store.get(key)
-        if found is None:
-            asked = next((message.text for message in reversed(request.messages) if message.role == "user"), "")
-            start = " ".join(asked.split())[:_SHOWN_CHARACTERS]
-            others = self._store.count(self.identity)
-            named = map(identity_in_words, self._store.identities()[:_SHOWN_OTHERS])
-            held = "" if others else "; it holds replies of: " + (", ".join(named) or "none")
-            raise (BackendError if others else BackendSetupError)(
-                f"{self._store.path} holds no reply to the {request.purpose!r} request {key[:12]} that begins {start!r}"
-                f" (of its backend, {identity_in_words(self.identity)}, it holds {others}{held})"
+        if found is not None:
+            return found
+        asked = next((message.text for message in reversed(request.messages) if message.role == "user"), "")
+        missing = f"the {request.purpose!r} request {key[:12]} that begins {_start(asked)!r}"
+        held = self._store.identities()
+        if self.identity in held:
+            raise BackendError(
+                f"{self._store.path} holds no reply to {missing} (of {self.identity}, it holds {held[self.identity]})"
             )
-        return found
+        raise BackendSetupError(
+            f"{self._store.path} holds no reply to {missing}, nor any of {self.identity};"
+            f" it holds replies of: {', '.join(held) or 'none'}"
+        )
 
     def close(self) -> None:
         """Closes the file."""
         self._store.close()
 
 
-class _Turns:
-    """One thread at a time per key."""
+def recorded_revision(cfg: BackendConfig, path: Path) -> str:
+    """Revision of the newest recorded replies of a backend whose revision is not known; "" when there are none.
 
-    def __init__(self) -> None:
-        self._guard = threading.Lock()
-        self._waiting: dict[str, tuple[threading.Lock, int]] = {}
+    Raises:
+        BackendSetupError: when the file cannot be used.
+    """
+    if not path.is_file():
+        return ""
+    with contextlib.closing(ReplyStore(path, read_only=True)) as store:
+        held = store.identities()
+    for identity in held:
+        with contextlib.suppress(ValueError, AttributeError):  # of a backend that is known by something else than JSON
+            revision = str(json.loads(identity).get("revision", ""))
+            if identity == identity_of(dataclasses.replace(cfg, revision=revision)):
+                return revision
+    return ""
 
-    @contextlib.contextmanager
-    def at(self, key: str) -> Iterator[None]:
-        with self._guard:
-            lock, waiting = self._waiting.get(key, (threading.Lock(), 0))
-            self._waiting[key] = lock, waiting + 1
-        try:
-            with lock:
-                yield
-        finally:
-            with self._guard:
-                waiting = self._waiting[key][1] - 1
-                if waiting:
-                    self._waiting[key] = lock, waiting
-                else:
-                    del self._waiting[key]
+
+def main(arguments: Sequence[str]) -> int:
+    """Command line; 0 on success, 2 on wrong arguments or files."""
+    given = list(arguments)
+    try:
+        if not shows_help(given, __doc__):
+            options = dict(argument.split("=", 1) for argument in given[1:] if "=" in argument)
+            if not given or len(options) != len(given) - 1 or not options.keys() <= {"show", "export", "import"}:
+                raise ValueError(f"{_USAGE}, got {' '.join(given) or 'nothing'}")
+            with contextlib.closing(ReplyStore(Path(given[0]), read_only="import" not in options)) as store:
+                for line in _told(store, options):
+                    sys.stdout.write(f"{line}\n")
+        sys.stdout.flush()  # what cannot be written is noticed here, not at the program's end
+    except BrokenPipeError:  # the reader, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (BackendError, ValueError, OSError) as error:
+        Console(stderr=True, highlight=False).print(f"cache: {error}", style="red", markup=False, soft_wrap=True)
+        return 2
+    return 0
+
+
+def _told(store: ReplyStore, options: dict[str, str]) -> Iterator[str]:
+    """Does what the options ask, and says it; without options a line per call."""
+    if "import" in options:
+        calls = _imported(Path(options["import"]))
+        yield f"{store.add(calls)} of {len(calls)} calls of {options['import']} are new"
+    if "show" in options:
+        found = [call for call in store.calls() if call.key.startswith(options["show"])]
+        if len(found) != 1:
+            raise ValueError(f"{len(found)} keys of {store.path} begin with {options['show']!r}, expected 1")
+        yield from _shown(found[0])
+    if "export" in options:
+        path = Path(options["export"])
+        if path.is_dir() or (path.exists() and path.samefile(store.path)):
+            raise ValueError(f"{path} is a folder, or the recorded replies themselves; it is not replaced")
+        lines = [
+            json.dumps({"version": _VERSION, **call.model_dump()}, ensure_ascii=False, sort_keys=True) for call in store.calls()
+        ]
+        write_text(path, "".join(f"{line}\n" for line in lines))
+        yield f"{len(lines)} calls in {path}"
+    for call in () if options else store.calls():
+        reply = call.reply
+        end = "" if reply.finish_reason == "stop" else f" [{reply.finish_reason}]"
+        tokens = f"{reply.prompt_tokens}+{reply.completion_tokens}"
+        head = f"{call.key[:12]}  {call.recorded_at}  {call.purpose:<10}  {reply.model}  {tokens:>10}{end}"
+        yield f"{head}  {_start(reply.text)}"
+
+
+def _shown(call: RecordedCall) -> Iterator[str]:
+    """A call in full."""
+    yield f"{call.key}  {call.recorded_at}  {call.purpose}"
+    yield json.dumps(call.question | {"messages": len(call.question["messages"])}, ensure_ascii=False, sort_keys=True)
+    for message in call.question["messages"]:
+        yield f"\n--- {message['role']}"
+        for part in message["content"]:
+            yield part if isinstance(part, str) else f"[{part['media_type']} {part['image']}]"
+    yield f"\n--- reply ({json.dumps(call.reply.model_dump(exclude={'text'}))})"
+    yield call.reply.text
+
+
+def _imported(path: Path) -> list[RecordedCall]:
+    """The calls of a file of JSON lines, each checked; the error of a line that is none names its number."""
+    calls: list[RecordedCall] = []
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            try:
+                raw: Any = json.loads(line)
+                if not isinstance(raw, dict):
+                    raise ValueError(f"expected an object, got {type(raw).__name__}")
+                if (version := raw.pop("version", None)) != _VERSION:
+                    raise ValueError(f"version {version!r} is unknown; known: {_VERSION}")
+                calls.append(RecordedCall.model_validate(raw))
+            except ValueError as error:
+                raise ValueError(f"{path}, line {number}: {' '.join(str(error).split())[:300]}") from error
+    return calls
+
+
+def _start(text: str) -> str:
+    return " ".join(text.split())[:_SHOWN_CHARACTERS]

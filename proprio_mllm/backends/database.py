@@ -1,10 +1,7 @@
-"""A small SQLite file that threads and processes of one machine share: replies, money.
+"""SQLite files that threads and processes of one machine share: recorded replies, a run's spending.
 
-Writes are transactions that reach the disk before they return, so that a process that is killed at any moment leaves a file
-that can be read. A file knows what it is for and the version of its tables. Write-ahead logging lets readers read while one
-writes; it needs a local disk.
-
-Paper: none (engineering).
+Every write is a transaction that is on the disk before it returns, so a process that is killed at any moment leaves a file that
+can be read. A file is marked with what it is for and with the version of its tables. Paper: none (engineering).
 """
 
 from __future__ import annotations
@@ -12,20 +9,17 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
-from urllib.parse import quote
 
 from proprio_mllm.backends.protocol import BackendError, BackendSetupError
 
 __all__ = ["Database", "Tables"]
 
-#: How long a write waits for those of others.
+#: How long a call waits for the writes of others.
 _BUSY_S: Final = 30.0
-_POLL_S: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +29,7 @@ class Tables:
     Attributes:
         purpose: in words, for messages.
         application: number that marks such files.
-        version: of the statements below; a file of another one is refused.
+        version: of the statements; a file of another version is refused.
         statements: that make the tables.
     """
 
@@ -46,7 +40,7 @@ class Tables:
 
 
 class Database:
-    """One connection, used by one thread at a time.
+    """One connection to a file, used by one thread at a time.
 
     Args:
         path: made with its folder when absent.
@@ -63,8 +57,19 @@ class Database:
         self._lock = threading.RLock()
         if read_only and not path.is_file():
             raise BackendSetupError(f"there is no {path} with {tables.purpose}")
-        with self._explained():
-            self._connection = self._read() if read_only else self._written()
+        with self._explained(), contextlib.ExitStack() as stack:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # isolation_level=None: transactions begin where `transaction` says, not before the first write
+            self._connection = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+            stack.callback(self._connection.close)
+            if read_only:
+                self._connection.execute("PRAGMA query_only = ON")
+                self._check()
+            else:
+                with self.transaction():
+                    self._make_tables()
+                    self._check()
+            stack.pop_all()
 
     def rows(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
         """Rows of a query.
@@ -82,57 +87,32 @@ class Database:
         Raises:
             BackendError: when the file cannot be written.
         """
-        with self._lock, self._explained(), _transaction(self._connection):
-            yield self._connection
+        with self._lock, self._explained():
+            self._connection.execute("BEGIN IMMEDIATE")
+            with self._connection:  # commits, or rolls back on an error
+                yield self._connection
 
     def close(self) -> None:
         """Closes the file."""
         with self._lock:
             self._connection.close()
 
-    def _written(self) -> sqlite3.Connection:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        connection = _connection(str(self.path.absolute()))
-        try:
-            with _transaction(connection):
-                if not connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0]:
-                    for statement in self._tables.statements:
-                        connection.execute(statement)
-                    connection.execute(f"PRAGMA application_id = {self._tables.application}")
-                    connection.execute(f"PRAGMA user_version = {self._tables.version}")
-                self._check(connection)
-            _log_ahead(connection)
-        except BaseException:
-            connection.close()
-            raise
-        return connection
+    def _make_tables(self) -> None:
+        if self.rows("SELECT COUNT(*) FROM sqlite_master") == [(0,)]:
+            marks = (
+                f"PRAGMA application_id = {self._tables.application}",
+                f"PRAGMA user_version = {self._tables.version}",
+            )
+            for statement in (*self._tables.statements, *marks):
+                self._connection.execute(statement)
 
-    def _read(self) -> sqlite3.Connection:
-        address = f"file:{quote(str(self.path.absolute()))}?mode=ro"
-        try:
-            return self._checked(_connection(address))
-        except sqlite3.OperationalError:
-            # A log beside the file cannot be made in a folder of others: a file without one is read as it stands.
-            if self.path.with_name(f"{self.path.name}-wal").exists():
-                raise
-            return self._checked(_connection(f"{address}&immutable=1"))
-
-    def _checked(self, connection: sqlite3.Connection) -> sqlite3.Connection:
-        try:
-            self._check(connection)
-        except BaseException:
-            connection.close()
-            raise
-        return connection
-
-    def _check(self, connection: sqlite3.Connection) -> None:
-        application = connection.execute("PRAGMA application_id").fetchone()[0]
-        version = connection.execute("PRAGMA user_version").fetchone()[0]
-        if application != self._tables.application:
-            raise BackendSetupError(f"{self.path} is a database, but not one of {self._tables.purpose}")
-        if version != self._tables.version:
-            known = self._tables.version
-            raise BackendSetupError(f"{self.path}: version {version} of {self._tables.purpose} is unknown; known: {known}")
+    def _check(self) -> None:
+        tables = self._tables
+        if self.rows("PRAGMA application_id") != [(tables.application,)]:
+            raise BackendSetupError(f"{self.path} is a database, but not one of {tables.purpose}")
+        ((version,),) = self.rows("PRAGMA user_version")
+        if version != tables.version:
+            raise BackendSetupError(f"{self.path}: version {version} of {tables.purpose} is unknown; known: {tables.version}")
 
     @contextlib.contextmanager
     def _explained(self) -> Iterator[None]:
@@ -151,34 +131,3 @@ class Database:
             ) from error
         except OSError as error:
             raise BackendSetupError(f"{self.path} cannot be used: {error}") from error
-
-
-def _connection(address: str) -> sqlite3.Connection:
-    uri = address.startswith("file:")
-    return sqlite3.connect(address, timeout=_BUSY_S, isolation_level=None, check_same_thread=False, uri=uri)
-
-
-def _log_ahead(connection: sqlite3.Connection) -> None:
-    """Switches the log on; SQLite does not wait by itself for others that do the same."""
-    deadline = time.monotonic() + _BUSY_S
-    while True:
-        try:
-            connection.execute("PRAGMA journal_mode = WAL")
-            break
-        except sqlite3.OperationalError:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(_POLL_S)
-    connection.execute("PRAGMA synchronous = FULL")
-
-
-@contextlib.contextmanager
-def _transaction(connection: sqlite3.Connection) -> Iterator[None]:
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        yield
-    except BaseException:
-        if connection.in_transaction:  # a full disk ends it by itself
-            connection.execute("ROLLBACK")
-        raise
-    connection.execute("COMMIT")

@@ -6,25 +6,24 @@ money is booked for calls that are made, not for those that wait. Paper: none (e
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from pathlib import Path
 from typing import Final
 
 from configs.schema.backend import BackendConfig
-from proprio_mllm.backends.address import on_this_machine
 from proprio_mllm.backends.cache import CachedBackend, ReplayBackend, recorded_revision
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.prices import price_of
 from proprio_mllm.backends.protocol import Backend
 from proprio_mllm.backends.scripted import ScriptedChat
-from proprio_mllm.backends.slots import Slots, SlottedBackend
+from proprio_mllm.backends.slots import SlottedBackend
 from proprio_mllm.backends.spending import Spending, SpendingBackend
 
 __all__ = ["SPENDING_FILE", "check_cap", "make_backend", "told_revision"]
 
 #: In a run's folder.
 SPENDING_FILE: Final = "spending.sqlite"
-_SLOTS_FOLDER: Final = "slots"
 
 logger = logging.getLogger(__name__)
 
@@ -50,16 +49,17 @@ def make_backend(cfg: BackendConfig, run: Path | None, cap_usd: float | None = N
     price = None if cfg.price is None else price_of(cfg.price)
     if price is not None and cfg.model not in price.models:
         logger.warning("backend %s: model %s is priced as %s", cfg.name, cfg.model or "of no name", cfg.price)
-    backend = _model(cfg)
-    try:
+    with contextlib.ExitStack() as made:
+        backend = _model(cfg)
+        made.callback(lambda: backend.close())  # whatever it is wrapped in by then
         if price is not None:
             spending = None if run is None else Spending(run / SPENDING_FILE, cap_usd)
             backend = SpendingBackend(backend, price, spending, cfg.name)
-        backend = SlottedBackend(backend, Slots(cfg.concurrency, None if run is None else run / _SLOTS_FOLDER / cfg.name))
-        return backend if cfg.cache is None else CachedBackend(backend, Path(cfg.cache))
-    except BaseException:
-        backend.close()
-        raise
+        backend = SlottedBackend(backend, cfg.concurrency, None if run is None else run / "slots" / cfg.name)
+        if cfg.cache is not None:
+            backend = CachedBackend(backend, Path(cfg.cache))
+        made.pop_all()
+        return backend
 
 
 def told_revision(cfg: BackendConfig) -> str:
@@ -70,20 +70,16 @@ def told_revision(cfg: BackendConfig) -> str:
     Raises:
         BackendSetupError: when the backend cannot be made.
     """
-    if cfg.kind != "openai" or cfg.base_url is None or not on_this_machine(cfg.base_url):
+    if cfg.kind != "openai" or not cfg.on_this_machine:
         return ""
     from proprio_mllm.backends.openai_chat import OpenAIChat
 
-    chat = OpenAIChat(cfg)
-    try:
+    with contextlib.closing(OpenAIChat(cfg)) as chat:
         told = chat.revision()
-    finally:
-        chat.close()
     if told is None:
         told = "" if cfg.cache is None else recorded_revision(cfg, Path(cfg.cache))
-        logger.warning(
-            "backend %s: %s does not answer%s", cfg.name, cfg.base_url, f"; its recorded replies are of {told}" if told else ""
-        )
+        recorded = f"; its recorded replies are of {told}" if told else ""
+        logger.warning("backend %s: %s does not answer%s", cfg.name, cfg.base_url, recorded)
     return told
 
 
@@ -93,10 +89,7 @@ def check_cap(cfg: BackendConfig, cap_usd: float | None) -> None:
     Raises:
         ValueError: when the price of what may cost money is not known.
     """
-    if cap_usd is None:
-        return
-    free = cfg.kind != "openai" or (cfg.base_url is not None and on_this_machine(cfg.base_url))
-    if cfg.price is None and not free:
+    if cap_usd is not None and cfg.price is None and cfg.kind == "openai" and not cfg.on_this_machine:
         raise ValueError(f"cost_cap_usd {cap_usd} cannot be held: backend.price of {cfg.name} is null")
 
 

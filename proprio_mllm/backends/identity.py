@@ -10,10 +10,9 @@ import json
 from pathlib import Path
 
 from configs.schema.backend import BackendConfig
-from configs.schema.checks import defaults_of
 from data.code_files import source_digest
 
-__all__ = ["identity_in_words", "identity_of"]
+__all__ = ["identity_of"]
 
 
 def identity_of(cfg: BackendConfig) -> str:
@@ -34,25 +33,6 @@ def identity_of(cfg: BackendConfig) -> str:
             "constrained": cfg.constrained,
         }
     )
-
-
-def identity_in_words(identity: str) -> str:
-    """An identity for messages: `backend.model=gpt-4o backend.structured=off`, or as it is when it is no such JSON."""
-    try:
-        values = json.loads(identity)
-    except ValueError:
-        return identity
-    if not isinstance(values, dict):
-        return identity
-    if "script" in values:
-        return f"a script of digest {values['script']}"
-    usual = defaults_of(BackendConfig)
-    told = (f"backend.{name}={_option(value)}" for name, value in values.items() if usual.get(name, ...) != value)
-    return " ".join(sorted(told, key=lambda one: not one.startswith("backend.model")))
-
-
-def _option(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _known_as(cfg: BackendConfig) -> str:

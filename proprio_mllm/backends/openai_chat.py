@@ -1,4 +1,4 @@
-"""A model behind an OpenAI-compatible URL: OpenAI, Gemini's compatible endpoint, vLLM, `transformers serve`.
+"""A model behind an OpenAI-compatible URL: OpenAI, Gemini's compatible endpoint, vLLM, `make serve`.
 
 One client for all of them, the `openai` package, with its own retries (time-outs, broken connections, 408, 409, 429, 5xx) and
 nothing stacked on them. Pictures are sent as data URLs of exactly the bytes they have, so that a digest of those bytes says
@@ -18,11 +18,9 @@ from typing import Any, Final
 import openai
 
 from configs.schema.backend import BackendConfig
-from proprio_mllm.backends.address import checked_url, on_this_machine
-from proprio_mllm.backends.api_failures import failure_of, is_refusal
-from proprio_mllm.backends.chat_completion import read_completion, shown_name
-from proprio_mllm.backends.http_client import MAX_REPLY_BYTES, bounded_client
+from proprio_mllm.backends.connection import MAX_REPLY_BYTES, bounded_client, checked_url, read_secret
 from proprio_mllm.backends.identity import identity_of
+from proprio_mllm.backends.openai_answers import failure_of, is_refusal, read_completion, shown_name
 from proprio_mllm.backends.protocol import (
     BackendError,
     BackendSetupError,
@@ -33,14 +31,12 @@ from proprio_mllm.backends.protocol import (
     LostReplyError,
     UnreachableError,
 )
-from proprio_mllm.backends.secret import read_secret
 from proprio_mllm.backends.structured import strict_schema
 
-__all__ = ["OPENAI_URL", "OpenAIChat"]
+__all__ = ["OpenAIChat"]
 
 #: Given explicitly, because the client would otherwise take another one from the environment.
-OPENAI_URL: Final = "https://api.openai.com/v1"
-
+_OPENAI_URL: Final = "https://api.openai.com/v1"
 _SHOWN_CHARACTERS: Final = 400
 _LIST_TIMEOUT_S: Final = 5.0
 
@@ -59,23 +55,21 @@ class OpenAIChat:
     """
 
     def __init__(self, cfg: BackendConfig, limit_bytes: int = MAX_REPLY_BYTES) -> None:
-        url = checked_url(cfg.base_url or OPENAI_URL, cfg.name)
-        self._own_machine = own_machine = on_this_machine(url)
+        url = checked_url(cfg.base_url or _OPENAI_URL, cfg.name)
         self.identity = identity_of(cfg)
         self._cfg = cfg
         self._limit_bytes = limit_bytes
-        self._secret = read_secret(cfg.key_env, cfg.name, optional=own_machine)
-        if url.startswith("http:") and not own_machine:
+        self._secret = read_secret(cfg.key_env, cfg.name, optional=cfg.on_this_machine)
+        if url.startswith("http:") and not cfg.on_this_machine:
             logger.warning("backend %s: the key in %s is sent unencrypted", cfg.name, cfg.key_env)
-        self._secret.guard()
         try:
-            http_client = bounded_client(cfg.timeout_s, own_machine, limit_bytes)
+            http_client = bounded_client(cfg.timeout_s, cfg.on_this_machine, limit_bytes)
         except (ImportError, OSError, ValueError) as error:
-            self._secret.release()
             raise BackendSetupError(
                 f"backend {cfg.name}: HTTP cannot be used as the environment asks (proxies: *_PROXY; certificates: SSL_CERT_*):"
                 f" {type(error).__name__}: {error}"
             ) from error
+        self._secret.guard()
         self._client = openai.OpenAI(
             api_key=self._secret.reveal(),
             base_url=url,
@@ -94,14 +88,17 @@ class OpenAIChat:
         """
         if self._client.is_closed():
             raise BackendError(f"backend {self._cfg.name}: closed")
-        body = self._body(request)
         start = time.perf_counter()
-        reply = self._asked(body)
+        reply = self._asked(request)
         latency_s = time.perf_counter() - start
         if isinstance(reply, BackendError):  # raised out here, so that no error of the client hangs on it
             where = f"{self._client.base_url}: " if isinstance(reply, UnreachableError) else ""
-            hint = "; is a server running there? `make serve` starts this project's" if where and self._own_machine else ""
-            raise type(reply)(f"backend {self._cfg.name}: {where}{_shortened(self._secret.redact(str(reply)))}{hint}")
+            hint = (
+                "; is a server running there? `make serve` starts this project's" if where and self._cfg.on_this_machine else ""
+            )
+            said = self._secret.redact(str(reply))
+            said = said if len(said) <= _SHOWN_CHARACTERS else f"{said[:_SHOWN_CHARACTERS]}…"
+            raise type(reply)(f"backend {self._cfg.name}: {where}{said}{hint}")
         if reply.prompt_tokens == 0 and reply.finish_reason != "refusal":
             logger.warning("backend %s: a reply without usable token counts", self._cfg.name)
         text, model = self._secret.redact(reply.text), self._secret.redact(reply.model)
@@ -115,8 +112,7 @@ class OpenAIChat:
         """
         try:
             listed = self._client.with_options(timeout=_LIST_TIMEOUT_S, max_retries=0).models.list()
-            cards = [card for card in listed.data if card.id == self._cfg.model]
-            told = (cards[0].model_extra or {}).get("revision") if cards else None
+            told = next(((card.model_extra or {}).get("revision") for card in listed.data if card.id == self._cfg.model), None)
         except openai.APIConnectionError as error:
             return None if isinstance(failure_of(error, _LIST_TIMEOUT_S, 0), UnreachableError) else ""
         except (openai.OpenAIError, AttributeError, TypeError, ValueError, RecursionError) as error:  # or it is no list
@@ -129,42 +125,25 @@ class OpenAIChat:
         self._client.close()
         self._secret.release()
 
-    def _same_weights(self, answered: str) -> None:
-        """Refuses a reply of other weights than the run is known by, as after a restart of the server in its midst."""
-        model, _, revision = answered.rpartition("@")
-        if self._own_machine and self._cfg.revision and model == self._cfg.model and revision != self._cfg.revision:
-            raise BackendSetupError(
-                f"backend {self._cfg.name}: {self._client.base_url} answers as {answered}, and this run is of revision"
-                f" {self._cfg.revision}; serve those weights, or start the command again"
-            )
-
-    def _asked(self, body: dict[str, Any]) -> ChatReply | BackendError:
+    def _asked(self, request: ChatRequest) -> ChatReply | BackendError:
         try:
-            raw = self._client.chat.completions.with_raw_response.create(**body)
+            raw = self._client.chat.completions.with_raw_response.create(**_body(self._cfg, request))
+            return read_completion(raw.http_response.content, raw.http_response.headers.get("content-type"))
+        except LostReplyError as error:
+            return error
         except openai.OpenAIError as error:
             if is_refusal(error):
                 return ChatReply("", finish_reason="refusal", model=self._cfg.model)
             return failure_of(error, self._cfg.timeout_s, self._cfg.retries)
-        response = raw.http_response
-        try:
-            return read_completion(response.content, response.headers.get("content-type"))
-        except LostReplyError as error:
-            return error
 
-    def _body(self, request: ChatRequest) -> dict[str, Any]:
-        body: dict[str, Any] = {
-            "model": self._cfg.model,
-            "messages": [_message(message) for message in request.messages],
-            "temperature": request.temperature,
-            self._cfg.token_limit_field: request.max_tokens,
-        }
-        if request.schema is not None and self._cfg.structured != "off":
-            response_format: dict[str, Any] = {"type": self._cfg.structured}
-            if self._cfg.structured == "json_schema":
-                schema = strict_schema(request.schema)
-                response_format["json_schema"] = {"name": request.schema.__name__, "strict": True, "schema": schema}
-            body["response_format"] = response_format
-        return body
+    def _same_weights(self, answered: str) -> None:
+        """Refuses a reply of other weights than the run is known by, as after a restart of the server in its midst."""
+        model, _, revision = answered.rpartition("@")
+        if self._cfg.on_this_machine and self._cfg.revision and model == self._cfg.model and revision != self._cfg.revision:
+            raise BackendSetupError(
+                f"backend {self._cfg.name}: {self._client.base_url} answers as {answered}, and this run is of revision"
+                f" {self._cfg.revision}; serve those weights, or start the command again"
+            )
 
     def __repr__(self) -> str:
         """Name and identity."""
@@ -175,8 +154,19 @@ class OpenAIChat:
         return OpenAIChat, (self._cfg, self._limit_bytes)
 
 
-def _shortened(text: str) -> str:
-    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
+def _body(cfg: BackendConfig, request: ChatRequest) -> dict[str, Any]:
+    body: dict[str, Any] = {
+        "model": cfg.model,
+        "messages": [_message(message) for message in request.messages],
+        "temperature": request.temperature,
+        cfg.token_limit_field: request.max_tokens,
+    }
+    if request.schema is not None and cfg.structured != "off":
+        form: dict[str, Any] = {"type": cfg.structured}
+        if cfg.structured == "json_schema":
+            form["json_schema"] = {"name": request.schema.__name__, "strict": True, "schema": strict_schema(request.schema)}
+        body["response_format"] = form
+    return body
 
 
 def _message(message: ChatMessage) -> dict[str, Any]:

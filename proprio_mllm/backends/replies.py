@@ -2,7 +2,7 @@
 
 A reply is found by the SHA-256 of the canonical JSON of all that decides it: the backend's identity, the messages with pictures
 as digests of their bytes, the schema, the longest reply, the temperature and, above temperature 0, the sample's number. That
-JSON is kept beside the reply, so that a file is a transcript to be read. The first reply to a request stands.
+JSON is kept beside the reply, so that a file is a transcript to be read. The first reply to a question stands.
 
 Paper: none (engineering).
 """
@@ -20,7 +20,7 @@ from typing import Any, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from proprio_mllm.backends.database import Database, Tables
-from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest
+from proprio_mllm.backends.protocol import BackendSetupError, ChatMessage, ChatReply, ChatRequest
 
 __all__ = ["RecordedCall", "RecordedReply", "ReplyStore", "question_of"]
 
@@ -33,33 +33,6 @@ _TABLES: Final = Tables(
         " question TEXT NOT NULL, reply TEXT NOT NULL)",
     ),
 )
-
-
-class _Picture(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    image: str
-    media_type: str
-
-
-class _Message(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    role: Literal["system", "user", "assistant"]
-    content: list[str | _Picture]
-
-
-class _Question(BaseModel):
-    """What `question_of` writes."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    identity: str
-    messages: list[_Message]
-    form: dict[str, Any] | None = Field(alias="schema")
-    max_tokens: int
-    temperature: float
-    sample: int = 0
 
 
 class RecordedReply(BaseModel):
@@ -75,10 +48,6 @@ class RecordedReply(BaseModel):
     model: str
     cost_usd: float | None = Field(ge=0.0, allow_inf_nan=False)
 
-    def to_reply(self) -> ChatReply:
-        """The reply, marked as cached."""
-        return ChatReply(**self.model_dump(), cached=True)
-
 
 class RecordedCall(BaseModel):
     """One question with its reply.
@@ -87,7 +56,7 @@ class RecordedCall(BaseModel):
         key: SHA-256 of the question's canonical JSON.
         purpose: what the call was for.
         recorded_at: UTC, ISO 8601.
-        question: of `question_of`.
+        question: all that decides the reply.
         reply: what came back.
     """
 
@@ -100,32 +69,17 @@ class RecordedCall(BaseModel):
     reply: RecordedReply
 
     @model_validator(mode="after")
-    def _question_fits(self) -> RecordedCall:
-        _Question.model_validate(self.question)
+    def _key_fits(self) -> RecordedCall:
         if self.key != _digest(_canonical(self.question)):
             raise ValueError(f"key {self.key!r} is not the SHA-256 of the question")
         return self
 
 
 def question_of(identity: str, request: ChatRequest) -> tuple[str, str]:
-    """Key and canonical JSON of all that decides a reply.
-
-    Args:
-        identity: of the backend.
-        request: that it is asked.
-    """
+    """Key and canonical JSON of all that decides a reply of the backend `identity`."""
     question: dict[str, Any] = {
         "identity": identity,
-        "messages": [
-            {
-                "role": message.role,
-                "content": [
-                    part if isinstance(part, str) else {"image": part.digest, "media_type": part.media_type}
-                    for part in message.content
-                ],
-            }
-            for message in request.messages
-        ],
+        "messages": [_recorded(message) for message in request.messages],
         "schema": None if request.schema is None else _schema(request.schema),
         "max_tokens": request.max_tokens,
         "temperature": float(request.temperature),
@@ -155,22 +109,21 @@ class ReplyStore:
         """The reply that is recorded under a key, marked as cached.
 
         Raises:
-            BackendError: when the file cannot be read.
+            BackendError: when the file cannot be read, or the reply is damaged.
         """
         rows = self._database.rows("SELECT reply FROM replies WHERE key = ?", key)
         if not rows:
             return None
         try:
-            return RecordedReply.model_validate_json(rows[0][0]).to_reply()
+            return ChatReply(**RecordedReply.model_validate_json(rows[0][0]).model_dump(), cached=True)
         except ValidationError as error:
-            raise BackendSetupError(f"{self.path}: the reply {key} is damaged: {_first(error)}") from error
+            raise self._damaged(key, error) from error
 
     def put(self, key: str, question: str, purpose: str, reply: ChatReply) -> bool:
-        """Records a reply; whether it is the first to its question.
+        """Records a reply that is not cut off; whether it is the first to its question.
 
         Raises:
             BackendError: when the file cannot be written.
-            ValueError: when the reply was cut off.
         """
         recorded = RecordedReply.model_validate({name: getattr(reply, name) for name in RecordedReply.model_fields})
         now = datetime.now(UTC).isoformat(timespec="seconds")
@@ -183,13 +136,12 @@ class ReplyStore:
             BackendSetupError: when one is damaged.
         """
         for (number,) in self._database.rows("SELECT rowid FROM replies ORDER BY rowid"):
-            columns = "key, purpose, recorded_at, question, reply"
-            row = self._database.rows(f"SELECT {columns} FROM replies WHERE rowid = ?", number)[0]
+            (row,) = self._database.rows("SELECT * FROM replies WHERE rowid = ?", number)
             try:
-                question, reply = json.loads(row[3]), RecordedReply.model_validate_json(row[4])
-                yield RecordedCall(key=row[0], purpose=row[1], recorded_at=row[2], question=question, reply=reply)
+                values = dict(zip(RecordedCall.model_fields, (*row[:3], *map(json.loads, row[3:])), strict=True))
+                yield RecordedCall.model_validate(values)
             except ValueError as error:
-                raise BackendSetupError(f"{self.path}: the reply {row[0]} is damaged: {_first(error)}") from error
+                raise self._damaged(row[0], error) from error
 
     def add(self, calls: Iterable[RecordedCall]) -> int:
         """Records calls of elsewhere, all or none; how many were new.
@@ -202,19 +154,13 @@ class ReplyStore:
             for call in calls
         )
 
-    def count(self, identity: str) -> int:
-        """Replies of one backend."""
-        return self._database.rows("SELECT COUNT(*) FROM replies WHERE json_extract(question, '$.identity') = ?", identity)[0][
-            0
-        ]
-
-    def identities(self) -> list[str]:
-        """The backends whose replies it holds, those of the newest replies first."""
+    def identities(self) -> dict[str, int]:
+        """The backends whose replies it holds, those of the newest replies first, and how many replies each has."""
         rows = self._database.rows(
-            "SELECT json_extract(question, '$.identity') AS one, MAX(rowid) AS newest FROM replies"
-            " GROUP BY one ORDER BY newest DESC"
+            "SELECT json_extract(question, '$.identity') AS identity, COUNT(*) FROM replies"
+            " GROUP BY identity ORDER BY MAX(rowid) DESC"
         )
-        return [str(identity) for identity, _ in rows]
+        return {str(identity): count for identity, count in rows}
 
     def close(self) -> None:
         """Closes the file."""
@@ -224,19 +170,25 @@ class ReplyStore:
         with self._database.transaction() as connection:
             return connection.executemany("INSERT INTO replies VALUES (?, ?, ?, ?, ?) ON CONFLICT DO NOTHING", rows).rowcount
 
+    def _damaged(self, key: str, error: ValueError) -> BackendSetupError:
+        return BackendSetupError(f"{self.path}: the reply {key} is damaged: {' '.join(str(error).split())[:200]}")
+
+
+def _recorded(message: ChatMessage) -> dict[str, Any]:
+    content = [
+        part if isinstance(part, str) else {"image": part.digest, "media_type": part.media_type} for part in message.content
+    ]
+    return {"role": message.role, "content": content}
+
 
 @functools.cache
 def _schema(model: type[BaseModel]) -> dict[str, Any]:
     return model.model_json_schema()
 
 
-def _canonical(values: dict[str, Any]) -> str:
-    return json.dumps(values, ensure_ascii=False, sort_keys=True, separators=(",", ":"), allow_nan=False)
+def _canonical(question: dict[str, Any]) -> str:
+    return json.dumps(question, ensure_ascii=False, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
 def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _first(error: ValueError) -> str:
-    return " ".join(str(error).split())[:200]

@@ -1,16 +1,15 @@
-"""Money: what a run's calls cost, and a cap that they hold to, over all threads and processes of the run.
+"""What a run's calls cost, and a cap that they hold to, over all threads and processes of the run.
 
-Before a call the most that it can cost is booked, afterwards what it did cost takes its place; a call whose booking would pass
-the cap is not made. The sum of bookings is thus never less than what was spent, with one exception: attempts that the OpenAI
-client repeats by itself after a time-out may be charged too, and a call is booked once.
+Before a call the most that it can cost is booked; afterwards its cost takes the place of the booking. A call whose booking
+would pass the cap is not made, so the sum of bookings is never less than what was spent, with one exception: attempts that the
+OpenAI client repeats by itself after a time-out may be charged too, and a call is booked once.
 
 What becomes of a booking:
 
 - a reply: its cost, or the booking as it stands when the server did not count the tokens;
 - a reply that was lost on the way: it stands, since it may have been charged;
 - no reply because the server refused or was not reached: nothing;
-- a process that was killed in a call: it stands, for the same reason as a lost reply. A resumed run goes on with what is left
-  of the cap; a kill costs it at most the calls that were under way, and blocks nothing.
+- a process that was killed in a call: it stands, as for a lost reply. A resumed run goes on with what is left of the cap.
 
 Paper: none (engineering).
 """
@@ -35,10 +34,9 @@ _TABLES: Final = Tables(
     statements=(
         "CREATE TABLE calls (number INTEGER PRIMARY KEY, at TEXT NOT NULL, backend TEXT NOT NULL, purpose TEXT NOT NULL,"
         " bound_usd REAL NOT NULL, cost_usd REAL)",
-        "CREATE TABLE total (usd REAL NOT NULL)",
-        "INSERT INTO total VALUES (0.0)",
     ),
 )
+_TOTAL: Final = "SELECT COALESCE(SUM(COALESCE(cost_usd, bound_usd)), 0.0) FROM calls"
 
 
 class Spending:
@@ -57,7 +55,7 @@ class Spending:
     def __init__(self, path: Path, cap_usd: float | None, read_only: bool = False) -> None:
         if cap_usd is not None and not cap_usd >= 0.0:
             raise ValueError(f"cost_cap_usd {cap_usd} must not be negative")
-        self.cap_usd = cap_usd
+        self._cap_usd = cap_usd
         self._database = Database(path, _TABLES, read_only)
 
     def book(self, bound_usd: float, backend: str = "", purpose: str = "") -> int:
@@ -69,15 +67,15 @@ class Spending:
         """
         now = datetime.now(UTC).isoformat(timespec="seconds")
         with self._database.transaction() as connection:
-            spent = connection.execute("SELECT usd FROM total").fetchone()[0]
-            if self.cap_usd is not None and spent + bound_usd > self.cap_usd:
+            spent = self.total_usd()
+            if self._cap_usd is not None and spent + bound_usd > self._cap_usd:
                 raise CostCapError(
                     f"backend {backend}: a call of up to {bound_usd:.4f} USD might pass the cap:"
-                    f" {spent:.4f} of {self.cap_usd:.4f} USD are spent or booked; a higher cost_cap_usd goes on from here"
+                    f" {spent:.4f} of {self._cap_usd:.4f} USD are spent or booked; a higher cost_cap_usd goes on from here"
                 )
-            connection.execute("UPDATE total SET usd = usd + ?", (bound_usd,))
-            values = (now, backend, purpose, bound_usd)
-            cursor = connection.execute("INSERT INTO calls (at, backend, purpose, bound_usd) VALUES (?, ?, ?, ?)", values)
+            cursor = connection.execute(
+                "INSERT INTO calls (at, backend, purpose, bound_usd) VALUES (?, ?, ?, ?)", (now, backend, purpose, bound_usd)
+            )
             assert cursor.lastrowid is not None
             return cursor.lastrowid
 
@@ -89,21 +87,17 @@ class Spending:
             BackendError: when the file cannot be written.
         """
         with self._database.transaction() as connection:
-            found = connection.execute(
-                "SELECT bound_usd FROM calls WHERE number = ? AND cost_usd IS NULL", (number,)
-            ).fetchone()
-            if found is None:
+            statement = "UPDATE calls SET cost_usd = ? WHERE number = ? AND cost_usd IS NULL"
+            if connection.execute(statement, (cost_usd, number)).rowcount != 1:
                 raise ValueError(f"there is no open booking {number}")
-            connection.execute("UPDATE calls SET cost_usd = ? WHERE number = ?", (cost_usd, number))
-            connection.execute("UPDATE total SET usd = usd + ?", (cost_usd - found[0],))
 
     def total_usd(self) -> float:
         """What is spent or booked."""
-        return max(0.0, self._database.rows("SELECT usd FROM total")[0][0])
+        return self._database.rows(_TOTAL)[0][0]
 
     def open_usd(self) -> float:
         """The part of it that is booked alone: calls under way, and those whose cost will never be known."""
-        return self._database.rows("SELECT COALESCE(SUM(bound_usd), 0.0) FROM calls WHERE cost_usd IS NULL")[0][0]
+        return self._database.rows(f"{_TOTAL} WHERE cost_usd IS NULL")[0][0]
 
     def close(self) -> None:
         """Closes the file."""

@@ -40,7 +40,7 @@ COMMANDS: Final = {
     ),
     "filter": ("data.filter_table", "what the motion filters dropped: FOLDER"),
     "retarget": ("data.retarget_report", "quality of retargeting"),
-    "replies": ("proprio_mllm.backends.transcripts", "recorded replies of language models: FILE"),
+    "replies": ("proprio_mllm.backends.cache", "recorded replies of language models: FILE"),
 }
 _PAIRED: Final[Mapping[str, Callable[[Run, Run], RunComparison]]] = {"compare": compare_runs, "gap": compare_bodies}
 _FORMATS: Final[Mapping[str, Callable[[Table], str]]] = {

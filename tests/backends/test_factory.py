@@ -18,7 +18,7 @@ from configs.schema.backend import BackendConfig
 from configs.validate import ConfigError, build
 from proprio_mllm.backends.cache import CachedBackend, ReplayBackend
 from proprio_mllm.backends.factory import SPENDING_FILE, make_backend
-from proprio_mllm.backends.identity import identity_in_words, identity_of
+from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.prices import price_of
 from proprio_mllm.backends.protocol import BackendError, BackendSetupError, ChatReply, CostCapError
 from proprio_mllm.backends.slots import SlottedBackend
@@ -127,13 +127,6 @@ def test_what_the_identity_depends_on(gpt4o: BackendConfig) -> None:
     for change in ({"model": "m"}, {"revision": "r"}, {"structured": "off"}, {"constrained": True}, {"dtype": "float16"}):
         assert identity_of(dataclasses.replace(gpt4o, kind="replay", **change)) != identity_of(gpt4o)
     assert KEY not in identity_of(gpt4o)
-
-
-def test_an_identity_in_words(gpt4o: BackendConfig) -> None:
-    changed = dataclasses.replace(gpt4o, revision="", structured="off")
-    assert identity_in_words(identity_of(changed)) == f"backend.model={gpt4o.model} backend.structured=off"
-    assert identity_in_words('{"script":"abc"}') == "a script of digest abc"
-    assert identity_in_words("answering") == "answering"
 
 
 def test_nothing_of_the_key_is_on_the_disk(gpt4o: BackendConfig, server: LoopbackServer, tmp_path: Path) -> None:

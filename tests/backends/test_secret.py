@@ -12,9 +12,9 @@ import traceback
 import pytest
 
 from configs.schema.backend import BackendConfig
+from proprio_mllm.backends.connection import Secret, read_secret
 from proprio_mllm.backends.openai_chat import OpenAIChat
 from proprio_mllm.backends.protocol import BackendError, BackendSetupError
-from proprio_mllm.backends.secret import Secret, read_secret
 from tests.backends.loopback import KEY, Handler, LoopbackServer, ask, completion
 
 
