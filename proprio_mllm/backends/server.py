@@ -15,8 +15,7 @@ import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
-from proprio_mllm.backends.protocol import Backend, BackendError
-from proprio_mllm.backends.rows import RequestError
+from proprio_mllm.backends.protocol import Backend, BackendError, RequestError
 from proprio_mllm.backends.wire import WireError, completion, error_object, model_list, read_request
 
 __all__ = ["BODY_BYTES", "ChatServer"]

@@ -14,8 +14,7 @@ import pytest
 from openai.types.chat import ChatCompletion
 
 from proprio_mllm.backends import server as server_module
-from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest
-from proprio_mllm.backends.rows import RequestError
+from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest, RequestError
 from proprio_mllm.backends.server import ChatServer
 
 
