@@ -7,32 +7,56 @@ the rows beside it, up to the rounding of sums, which in half precision can tip 
 Temperature 0 takes the most likely token, nothing else: the sampling and the repetition penalty that a checkpoint's files
 recommend (Qwen2.5-VL: 1.05) are not applied, as they are not by the servers of the other models.
 
-Paper: the local baselines of Table II.
+Shape letters: B rows, L tokens of the longest prompt. Paper: the local baselines of Table II.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import io
 import logging
 import threading
 import time
 from collections.abc import Sequence
+from typing import Any, Final
 
 import torch
+from jinja2.exceptions import TemplateError
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
 from transformers import LogitsProcessorList, StoppingCriteriaList
 
 from configs.schema.backend import BackendConfig
 from proprio_mllm.backends.batching import Batcher
 from proprio_mllm.backends.checkpoint import Loaded, find_checkpoint, load_checkpoint
-from proprio_mllm.backends.decoding import Limits, Rule, Rules
-from proprio_mllm.backends.grammar import Grammars, import_xgrammar
+from proprio_mllm.backends.decoding import Grammars, GrammarState, Limits, Rule, Rules, import_xgrammar
 from proprio_mllm.backends.identity import identity_of
-from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest
-from proprio_mllm.backends.rows import Row, collate, encode, seed_of
+from proprio_mllm.backends.protocol import BackendError, ChatImage, ChatMessage, ChatReply, ChatRequest, RequestError
 
-__all__ = ["LocalChat"]
+__all__ = ["LocalChat", "Row", "encode", "open_picture"]
+
+#: Longest side of a picture, in pixels.
+_LARGEST_SIDE: Final = 4096
 
 logger = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Row:
+    """A request, ready for the model.
+
+    Attributes:
+        request: the question.
+        inputs: the processor's tensors, a batch of one.
+        prompt: tokens of the prompt.
+        limit: most tokens of the reply: `max_tokens`, or what the model's context leaves.
+    """
+
+    request: ChatRequest
+    inputs: dict[str, Tensor]
+    prompt: int
+    limit: int
 
 
 class LocalChat:
@@ -51,19 +75,16 @@ class LocalChat:
         if cfg.constrained:
             import_xgrammar()  # a missing extra stops here, before weights load
         checkpoint = find_checkpoint(cfg.model)
-        revision = cfg.revision or checkpoint.fingerprint()
-        self._loaded: Loaded | None = load_checkpoint(checkpoint, cfg)
-        model = self._loaded.model
-        self._grammars = (
-            Grammars(self._loaded.processor.tokenizer, self._loaded.vocabulary, self._loaded.ends) if cfg.constrained else None
-        )
+        loaded = load_checkpoint(checkpoint, cfg)
+        self._loaded: Loaded | None = loaded
+        self._grammars = Grammars(loaded.processor.tokenizer, loaded.vocabulary, loaded.ends) if cfg.constrained else None
+        self.revision = cfg.revision or checkpoint.fingerprint()
         #: Model and revision, as replies name them.
-        self.model = f"{checkpoint.folder.resolve().name}@{revision}"
-        self.revision = revision
+        self.model = f"{checkpoint.folder.resolve().name}@{self.revision}"
         #: As recorded replies are known: without a revision of the configuration, they belong to this fingerprint.
-        self.identity = identity_of(dataclasses.replace(cfg, revision=revision))
+        self.identity = identity_of(dataclasses.replace(cfg, revision=self.revision))
         #: Where it runs and with how many tokens of prompt and reply together, for people.
-        self.device, self.context = str(model.device), self._loaded.context
+        self.device, self.context = str(loaded.model.device), loaded.context
         self._encoding = threading.Lock()  # tokenizers are not made for several threads at once
         self._batcher: Batcher[Row, ChatReply] = Batcher(self._answer, cfg.batch)
 
@@ -80,19 +101,11 @@ class LocalChat:
         """
         started = time.perf_counter()
         loaded = self._open()
-        if self._grammars is not None and request.schema is not None:
-            self._grammars.compiled(request.schema)  # a schema that has no grammar is this request's error, not its batch's
+        self._grammar(request)  # a schema that has no grammar is this request's error, not its batch's
         with self._encoding:
             row = encode(loaded.processor, request, loaded.context)
         reply = self._batcher.ask(row)
-        return ChatReply(
-            reply.text,
-            reply.prompt_tokens,
-            reply.completion_tokens,
-            time.perf_counter() - started,
-            reply.finish_reason,
-            self.model,
-        )
+        return dataclasses.replace(reply, latency_s=time.perf_counter() - started, model=self.model)
 
     def close(self) -> None:
         """Frees the model once the batch under way is answered; calls that wait, and later ones, get an error."""
@@ -105,6 +118,10 @@ class LocalChat:
         if self._loaded is None:
             raise BackendError(f"{self.model} is closed")
         return self._loaded
+
+    def _grammar(self, request: ChatRequest) -> GrammarState | None:
+        grammars, schema = self._grammars, request.schema
+        return None if grammars is None or schema is None else grammars.start(schema)
 
     def _answer(self, rows: Sequence[Row]) -> list[ChatReply | Exception]:
         """One reply per row, or its error; a batch that does not fit the GPU's memory is halved until it does."""
@@ -121,26 +138,111 @@ class LocalChat:
 
     def _generate(self, loaded: Loaded, rows: Sequence[Row]) -> list[ChatReply]:
         """Replies to one batch; latency and model are filled in by the caller."""
-        model, tokenizer = loaded.model, loaded.processor.tokenizer
-        batch = collate(rows, loaded.pad, model.device, model.dtype)
+        batch = _collate(rows, loaded.pad, loaded.model.device, loaded.model.dtype)
         width = batch["input_ids"].shape[1]
         limits = [row.limit for row in rows]
-        made = model.generate(
+        asked = [row.request for row in rows]
+        rules = [Rule(request.temperature, _seed(request), self._grammar(request)) for request in asked]
+        made = loaded.model.generate(
             **batch,
             do_sample=False,
             max_new_tokens=max(limits),
-            logits_processor=LogitsProcessorList([Rules([self._rule(row.request) for row in rows])]),
+            logits_processor=LogitsProcessorList([Rules(rules)]),
             stopping_criteria=StoppingCriteriaList([Limits(width, limits)]),
         )
         replies: list[ChatReply] = []
         for row, ids in zip(rows, made[:, width:].tolist(), strict=True):
             end = next((index for index, token in enumerate(ids[: row.limit]) if token in loaded.ends), None)
             ids = ids[: row.limit] if end is None else ids[: end + 1]
-            text = tokenizer.decode(ids, skip_special_tokens=True)
+            text = loaded.processor.tokenizer.decode(ids, skip_special_tokens=True)
             replies.append(ChatReply(text, row.prompt, len(ids), finish_reason="length" if end is None else "stop"))
         return replies
 
-    def _rule(self, request: ChatRequest) -> Rule:
-        grammars, schema = self._grammars, request.schema
-        grammar = grammars.start(schema) if grammars is not None and schema is not None else None
-        return Rule(request.temperature, seed_of(request), grammar)
+
+def encode(processor: Any, request: ChatRequest, context: int) -> Row:
+    """A request as the model reads it. Control tokens in its texts, such as those that end a turn, are read as plain letters.
+
+    Args:
+        processor: the checkpoint's.
+        request: the question.
+        context: most tokens of prompt and reply together.
+
+    Raises:
+        RequestError: when the prompt leaves no room for a reply, or the processor cannot take it.
+    """
+    chat = [_turn(message) for message in request.messages]
+    try:
+        made = processor.apply_chat_template(
+            chat,
+            add_generation_prompt=True,
+            tokenize=True,
+            return_dict=True,
+            sanitize_control_tokens=True,
+            processor_kwargs={"return_tensors": "pt"},
+        )
+    except (ValueError, TemplateError) as error:
+        raise RequestError(f"the model's processor cannot take the request: {error}") from error
+    inputs: dict[str, Tensor] = dict(made)
+    prompt = inputs["input_ids"].shape[1]
+    if prompt >= context:
+        raise RequestError(f"prompt of {prompt} tokens; the model's context of {context} leaves no room for a reply")
+    return Row(request, inputs, prompt, min(request.max_tokens, context - prompt))
+
+
+def open_picture(image: ChatImage) -> Image.Image:
+    """The decoded picture, in RGB.
+
+    Raises:
+        RequestError: when it cannot be read, or has a side above 4096 pixels.
+    """
+    try:
+        opened = Image.open(io.BytesIO(image.data), formats=("PNG", "JPEG"))
+        if max(opened.size) > _LARGEST_SIDE:
+            raise RequestError(f"picture of {opened.width} x {opened.height} pixels; allowed: sides up to {_LARGEST_SIDE}")
+        return opened.convert("RGB")
+    except UnidentifiedImageError as error:
+        raise RequestError(f"picture of {len(image.data)} bytes is neither PNG nor JPEG") from error
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise RequestError(f"picture of {len(image.data)} bytes cannot be read: {error}") from error
+
+
+def _turn(message: ChatMessage) -> dict[str, Any]:
+    """A message as chat templates take it; a blank line stands between texts that follow each other."""
+    parts: list[dict[str, Any]] = []
+    for part in message.content:
+        if isinstance(part, ChatImage):
+            parts.append({"type": "image", "image": open_picture(part)})
+        elif parts and parts[-1]["type"] == "text":
+            parts[-1]["text"] += f"\n\n{part}"
+        else:
+            parts.append({"type": "text", "text": part})
+    return {"role": message.role, "content": parts}
+
+
+def _seed(request: ChatRequest) -> int:
+    """Seed of a request's draws, from its words, pictures and sample index alone."""
+    digest = hashlib.sha256()
+    for message in request.messages:
+        digest.update(f"\0{message.role}".encode())
+        for part in message.content:
+            digest.update(f"\0{part if isinstance(part, str) else part.digest}".encode())
+    digest.update(f"\0{request.sample}".encode())
+    return int.from_bytes(digest.digest()[:7], "big")
+
+
+def _collate(rows: Sequence[Row], pad: int, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
+    """One batch of several rows.
+
+    What has one entry per token is padded on the left, ids with `pad` and the rest with 0; what has one entry per picture, tile
+    or patch is put one after another.
+    """
+    longest = max(row.prompt for row in rows)
+    batch: dict[str, Tensor] = {}
+    for name in dict.fromkeys(name for row in rows for name in row.inputs):
+        parts = [row.inputs[name] for row in rows if name in row.inputs]
+        if name in ("input_ids", "attention_mask", "mm_token_type_ids"):
+            fill = pad if name == "input_ids" else 0
+            parts = [torch.nn.functional.pad(part, (longest - part.shape[1], 0), value=fill) for part in parts]  # (1, L)
+        joined = torch.cat(parts)  # (B, L), or (pictures, ...)
+        batch[name] = joined.to(device, dtype if joined.is_floating_point() else None)
+    return batch

@@ -189,11 +189,11 @@ def _usage(usage: object) -> tuple[int, int]:
     """Tokens read and written; (0, 0) when they are not known."""
     if not isinstance(usage, Mapping):
         return 0, 0
-    told = usage.get("prompt_tokens"), usage.get("completion_tokens", 0), usage.get("total_tokens", 0)
-    counts = [one for one in told if isinstance(one, int) and not isinstance(one, bool) and 0 <= one <= _MOST_TOKENS]
-    if len(counts) < len(told):
+    prompt: Any = usage.get("prompt_tokens")
+    written: Any = usage.get("completion_tokens", 0)
+    total: Any = usage.get("total_tokens", 0)
+    if any(type(count) is not int or not 0 <= count <= _MOST_TOKENS for count in (prompt, written, total)):
         return 0, 0
-    prompt, written, total = counts
     return prompt, max(written, total - prompt)
 
 

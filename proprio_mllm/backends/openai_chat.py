@@ -91,14 +91,8 @@ class OpenAIChat:
         start = time.perf_counter()
         reply = self._asked(request)
         latency_s = time.perf_counter() - start
-        if isinstance(reply, BackendError):  # raised out here, so that no error of the client hangs on it
-            where = f"{self._client.base_url}: " if isinstance(reply, UnreachableError) else ""
-            hint = (
-                "; is a server running there? `make serve` starts this project's" if where and self._cfg.on_this_machine else ""
-            )
-            said = self._secret.redact(str(reply))
-            said = said if len(said) <= _SHOWN_CHARACTERS else f"{said[:_SHOWN_CHARACTERS]}…"
-            raise type(reply)(f"backend {self._cfg.name}: {where}{said}{hint}")
+        if isinstance(reply, BackendError):
+            raise self._shown(reply)  # out here, so that no error of the client hangs on it
         if reply.prompt_tokens == 0 and reply.finish_reason != "refusal":
             logger.warning("backend %s: a reply without usable token counts", self._cfg.name)
         text, model = self._secret.redact(reply.text), self._secret.redact(reply.model)
@@ -136,6 +130,16 @@ class OpenAIChat:
                 return ChatReply("", finish_reason="refusal", model=self._cfg.model)
             return failure_of(error, self._cfg.timeout_s, self._cfg.retries)
 
+    def _shown(self, error: BackendError) -> BackendError:
+        """An error for people: short, named after the backend, and without the key."""
+        said = self._secret.redact(str(error))
+        said = said if len(said) <= _SHOWN_CHARACTERS else f"{said[:_SHOWN_CHARACTERS]}…"
+        if isinstance(error, UnreachableError):
+            said = f"{self._client.base_url}: {said}"
+            if self._cfg.on_this_machine:
+                said += "; is a server running there? `make serve` starts this project's"
+        return type(error)(f"backend {self._cfg.name}: {said}")
+
     def _same_weights(self, answered: str) -> None:
         """Refuses a reply of other weights than the run is known by, as after a restart of the server in its midst."""
         model, _, revision = answered.rpartition("@")
@@ -161,11 +165,11 @@ def _body(cfg: BackendConfig, request: ChatRequest) -> dict[str, Any]:
         "temperature": request.temperature,
         cfg.token_limit_field: request.max_tokens,
     }
-    if request.schema is not None and cfg.structured != "off":
-        form: dict[str, Any] = {"type": cfg.structured}
-        if cfg.structured == "json_schema":
-            form["json_schema"] = {"name": request.schema.__name__, "strict": True, "schema": strict_schema(request.schema)}
-        body["response_format"] = form
+    if request.schema is not None and cfg.structured == "json_object":
+        body["response_format"] = {"type": "json_object"}
+    if request.schema is not None and cfg.structured == "json_schema":
+        schema = {"name": request.schema.__name__, "strict": True, "schema": strict_schema(request.schema)}
+        body["response_format"] = {"type": "json_schema", "json_schema": schema}
     return body
 
 

@@ -11,7 +11,7 @@ Paper: baselines of Table II. The paper calls its models through their vendors' 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
 from pydantic import BaseModel
@@ -27,6 +27,7 @@ __all__ = [
     "CostCapError",
     "FinishReason",
     "LostReplyError",
+    "RequestError",
     "UnreachableError",
 ]
 
@@ -40,6 +41,10 @@ class BackendError(RuntimeError):
 
 class BackendSetupError(BackendError):
     """A call that no repetition mends: no key, a wrong one, an unknown model or URL."""
+
+
+class RequestError(BackendError):
+    """A request that the model cannot take, however often it is asked: too long, or a picture that cannot be read."""
 
 
 class LostReplyError(BackendError):
@@ -130,10 +135,6 @@ class ChatReply:
     model: str = ""
     cost_usd: float | None = 0.0
     cached: bool = False
-
-    def from_cache(self) -> ChatReply:
-        """The same reply, marked as cached."""
-        return replace(self, cached=True)
 
 
 @runtime_checkable

@@ -15,8 +15,7 @@ from tokenizers.processors import TemplateProcessing
 
 from configs.schema.backend import BackendConfig
 from proprio_mllm.backends import checkpoint
-from proprio_mllm.backends.checkpoint import find_checkpoint, load_checkpoint
-from proprio_mllm.backends.processors import InternVLImages, QwenImages
+from proprio_mllm.backends.checkpoint import InternVLImages, QwenImages, find_checkpoint, load_checkpoint
 from proprio_mllm.backends.protocol import BackendSetupError
 
 TINY = Path(__file__).parents[2] / "weights" / "tiny"

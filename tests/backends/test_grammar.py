@@ -10,8 +10,8 @@ from typing import Any, Literal
 import pytest
 from pydantic import BaseModel, Field
 
-from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest
-from proprio_mllm.backends.rows import RequestError, encode
+from proprio_mllm.backends.local import encode
+from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest, RequestError
 
 INSTALLED = importlib.util.find_spec("xgrammar") is not None
 needs_xgrammar = pytest.mark.skipif(not INSTALLED, reason="xgrammar is not installed; pip install 'proprio-mllm[constrained]'")
@@ -42,7 +42,7 @@ def test_a_missing_extra_is_named(folder: Path, open_chat: Callable[..., Any]) -
 @needs_xgrammar
 def test_replies_keep_to_the_schema(folder: Path, open_chat: Callable[..., Any], ask: Callable[..., ChatRequest]) -> None:
     chat, free = open_chat(folder, constrained=True), open_chat(folder)
-    assert chat.identity == f"{free.identity} constrained"
+    assert chat.identity == free.identity.replace('"constrained":false', '"constrained":true')
     steps: set[Step] = set()
     for sample in range(4):
         request = ask("pick the mug", schema=Step, temperature=1.5, sample=sample, max_tokens=200)

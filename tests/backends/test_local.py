@@ -22,11 +22,10 @@ from transformers import AutoModelForImageTextToText
 
 from data.interface.steps import PlanStep
 from proprio_mllm.backends import local
+from proprio_mllm.backends.checkpoint import load_chat_processor
 from proprio_mllm.backends.identity import identity_of
-from proprio_mllm.backends.local import LocalChat
-from proprio_mllm.backends.processors import load_chat_processor
-from proprio_mllm.backends.protocol import Backend, BackendError, ChatImage, ChatMessage, ChatReply, ChatRequest
-from proprio_mllm.backends.rows import RequestError, encode, open_picture
+from proprio_mllm.backends.local import LocalChat, encode, open_picture
+from proprio_mllm.backends.protocol import Backend, BackendError, ChatImage, ChatMessage, ChatReply, ChatRequest, RequestError
 from proprio_mllm.model.batch import Collator, Example, View
 from proprio_mllm.model.building import load_model
 from proprio_mllm.model.prompts import looking, plan_prompt

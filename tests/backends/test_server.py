@@ -14,8 +14,7 @@ import pytest
 from openai.types.chat import ChatCompletion
 
 from proprio_mllm.backends import server as server_module
-from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest
-from proprio_mllm.backends.rows import RequestError
+from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest, RequestError
 from proprio_mllm.backends.server import ChatServer
 
 
@@ -112,7 +111,7 @@ def test_calls_that_are_no_chats_are_refused(served: ChatServer, monkeypatch: py
     assert raw(served, plain) == (415, error("Content-Type 'text/plain'; expected application/json"))
     assert raw(served, chat) == (411, error("Content-Length ''; expected a number"))
     assert raw(served, f"{chat}\nContent-Length: -1") == (411, error("Content-Length '-1'; expected a number"))
-    monkeypatch.setattr(server_module, "BODY_BYTES", 2000)
+    monkeypatch.setattr(server_module, "_BODY_BYTES", 2000)
     status, content = raw(served, f"{chat}\nContent-Length: 2001", b"x" * 2001)
     assert (status, content) == (413, error("request of 2001 bytes; allowed: 2000"))
     assert raw(served, f"{chat}\nContent-Length: 2", b"{}")[0] == 400

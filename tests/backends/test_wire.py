@@ -12,7 +12,7 @@ from openai.types import Model
 from openai.types.chat import ChatCompletion
 
 from proprio_mllm.backends.protocol import ChatImage, ChatMessage, ChatReply
-from proprio_mllm.backends.wire import WireError, completion, model_list, read_request
+from proprio_mllm.backends.server import RefusedError, completion, model_list, read_request
 
 TURN = {"role": "user", "content": "look"}
 SCHEMA = {"name": "step", "schema": {"type": "object", "properties": {"b": {}, "a": {}}}, "strict": True}
@@ -52,7 +52,7 @@ def test_a_schema_is_handed_on_as_it_came() -> None:
     assert schema is not None
     assert schema.__name__ == "step"
     assert json.dumps(schema.model_json_schema()) == json.dumps(SCHEMA["schema"])
-    with pytest.raises(WireError, match=r"cannot hold replies to a schema; allowed: text\. Start it with constrained=true"):
+    with pytest.raises(RefusedError, match=r"cannot hold replies to a schema; allowed: text\. Start it with constrained=true"):
         read_request(body(response_format=asked), "tiny", False)
 
 
@@ -61,7 +61,7 @@ def test_a_schema_is_handed_on_as_it_came() -> None:
     [
         ({"messages": []}, "messages: List should have at least 1 item"),
         ({"messages": [{"role": "robot", "content": "x"}]}, r"messages\.0\.role: Input should be 'system'"),
-        ({"messages": [{"role": "user", "content": []}]}, r"messages\.0\.content: expected at least one part, got none"),
+        ({"messages": [{"role": "user", "content": []}]}, r"messages\.0\.content.*List should have at least 1 item"),
         ({"messages": [{"role": "user", "content": [{"type": "sound"}]}]}, r"messages\.0\.content.*'sound'"),
         ({"max_tokens": 0}, "max_tokens: Input should be greater than or equal to 1"),
         ({"temperature": 3}, "temperature: Input should be less than or equal to 2"),
@@ -73,18 +73,18 @@ def test_a_schema_is_handed_on_as_it_came() -> None:
     ],
 )
 def test_what_cannot_be_honoured_is_refused(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(WireError, match=message) as caught:
+    with pytest.raises(RefusedError, match=message) as caught:
         read_request(body(**fields), "tiny", True)
     assert caught.value.status == 400
 
 
 def test_what_is_no_json_is_refused() -> None:
-    with pytest.raises(WireError, match="body: Invalid JSON"):
+    with pytest.raises(RefusedError, match="body: Invalid JSON"):
         read_request(b"{", "tiny", False)
 
 
 def test_another_model_is_not_found() -> None:
-    with pytest.raises(WireError, match="model 'gpt' is not served; allowed: tiny") as caught:
+    with pytest.raises(RefusedError, match="model 'gpt' is not served; allowed: tiny") as caught:
         read_request(body(model="gpt"), "tiny", False)
     assert (caught.value.status, caught.value.code) == (404, "model_not_found")
 
@@ -100,7 +100,7 @@ def test_another_model_is_not_found() -> None:
 )
 def test_pictures_come_with_the_request_alone(url: str, message: str) -> None:
     turn = {"role": "user", "content": [{"type": "image_url", "image_url": {"url": url}}]}
-    with pytest.raises(WireError, match=message):
+    with pytest.raises(RefusedError, match=message):
         read_request(body(messages=[turn]), "tiny", False)
 
 
