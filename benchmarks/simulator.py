@@ -30,6 +30,7 @@ from sim.robots.spec import load_robot
 from sim.scene.compiler import build_spec
 from sim.session.session import FreePlay, Session
 from sim.tasks.task import load_benchmark
+from sim.world.scene_state import scene_key
 from sim.world.world import World
 
 CERTIFICATES = Path(sim.tasks.__file__).parent / "certificates.jsonl"
@@ -69,7 +70,7 @@ def default_renderer(world: World, size: int) -> Callable[[], Any]:
     """Draws the same scene as MuJoCo does when nobody tells it otherwise."""
     import mujoco  # sim, above, has chosen the OpenGL backend
 
-    spec = build_spec(world._key)
+    spec = build_spec(scene_key(world.robot, world.room, [name for name, obj in world.objects.items() if obj.movable]))
     plain = mujoco.MjSpec()
     visual: Any = spec.visual
     visual.quality.offsamples = plain.visual.quality.offsamples

@@ -23,7 +23,7 @@ from sim.scene.compiler import SceneKey, compile_scene
 from sim.scene.objects import ObjectInstance, ObjectState, index_object
 from sim.scene.rooms import Room
 
-__all__ = ["SceneState", "WorldError", "build_scene"]
+__all__ = ["SceneState", "WorldError", "build_scene", "scene_key"]
 
 
 class WorldError(ValueError):
@@ -92,13 +92,7 @@ def build_scene(
         furniture: ids of the room's furniture.
         movable: ids of all other objects, in the order in which they will be placed.
     """
-    ids = tuple(sorted(movable))
-    if robot is None:
-        key = SceneKey("", "", "", (), room.name, ids)
-    else:
-        path = str(robot.mjcf_path)
-        hands = _hand_bodies(path, tuple(robot.arms[side].grasp_site for side in SIDES))
-        key = SceneKey(robot.name, path, robot.root_body, hands, room.name, ids)
+    key = scene_key(robot, room, movable)
     model = copy.copy(compile_scene(key))
     templates, parts, owners = _indexed(key, (*furniture, *movable), catalogue)
     objects = {name: dataclasses.replace(item, state=ObjectState(), held_by=[]) for name, item in templates.items()}
@@ -106,6 +100,16 @@ def build_scene(
     bodies = frozenset(body for body in range(1, model.nbody) if int(model.body_rootid[body]) in roots)
     name = f"{key.mjcf_path}|{room.name}"
     return SceneState(repr(key), name, robot, room, catalogue, model, mujoco.MjData(model), objects, parts, owners, bodies)
+
+
+def scene_key(robot: RobotSpec | None, room: Room, movable: Sequence[str]) -> SceneKey:
+    """What decides a compiled scene."""
+    ids = tuple(sorted(movable))
+    if robot is None:
+        return SceneKey("", "", "", (), room.name, ids)
+    path = str(robot.mjcf_path)
+    hands = _hand_bodies(path, tuple(robot.arms[side].grasp_site for side in SIDES))
+    return SceneKey(robot.name, path, robot.root_body, hands, room.name, ids)
 
 
 @functools.cache
