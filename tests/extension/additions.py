@@ -88,7 +88,7 @@ def tap(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     del outcome_draw
     reach = assess_tap(body, action)
     assert action.arm is not None and action.object_id is not None
-    arm, solid = action.arm, body.objects.solid_geoms(body.thing(action.object_id))
+    arm, solid = action.arm, body.objects.solid_geoms(body.obj(action.object_id))
     yield from body.hands.move(arm, body.spec.hand.press[2], 0.2)
     yield from body.arms.move(arm, [*reach.way, reach.before])
     yield from body.arms.touch(arm, reach.at, solid, speed=0.7)
