@@ -81,9 +81,8 @@ def run_app(root: str, schema: type[T], job: Callable[[T], int], about: str, arg
         sys.stderr.write(f"{root}.py: {error}\n")
         return 2
     except COMPOSITION_ERRORS as error:
-        sys.stderr.write(
-            f"{root}.py: {explain(error, root, [one for one in given if '=' in one] or given, _own_folder(given))}\n"
-        )
+        overrides = [one for one in given if "=" in one and not one.startswith("--")] or given
+        sys.stderr.write(f"{root}.py: {explain(error, root, overrides, _own_folder(given))}\n")
         return 2
     finally:
         sys.argv = before[0]

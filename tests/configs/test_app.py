@@ -80,6 +80,8 @@ def test_a_mistake_beside_a_folder_of_groups_blames_no_group_of_it(tmp_path: Pat
     (tmp_path / "planner" / "mine.yaml").write_text("name: mine\nkind: random\nlabel: Mine\n")
     assert _jobs(["--config-dir", str(tmp_path), "planner=mine", "trails=2"]) == (2, [])
     assert "did you mean 'trials'?" in capsys.readouterr().err
+    assert _jobs([f"--config-dir={tmp_path}", "planner=mine", "trails=2"]) == (2, [])
+    assert "did you mean 'trials'?" in capsys.readouterr().err
     assert _jobs([f"--config-dir={tmp_path}", "planner=mne"]) == (2, [])
     assert "did you mean 'mine'?" in capsys.readouterr().err
 
