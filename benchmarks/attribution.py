@@ -23,8 +23,7 @@ from typing import Any, Final, Literal
 from rich.progress import Progress
 
 from benchmarks.fault_episodes import Cell, CellRunner, ScriptedResult, cells
-from configs.arguments import read_arguments
-from configs.validate import ConfigError
+from configs.arguments import command, read_arguments
 from data.files import write_text
 from data.interface.episode import Outcome
 from data.interface.failures import FailureCategory
@@ -233,14 +232,11 @@ def _to_json(config: ValidationConfig, found: Validation, results: Sequence[Scri
     }
 
 
+@command()
 def main(arguments: Sequence[str]) -> int:
     """Command line; returns the exit code."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    try:
-        config = read_arguments(ValidationConfig, arguments)
-    except ConfigError as error:
-        sys.stderr.write(f"validation: {error}\n")
-        return 2
+    config = read_arguments(ValidationConfig, arguments)
     with Progress() as progress:
         results = run_cells(cells(config.robots, config.seed, config.per_cause), config.workers, progress)
     found = validate(results)

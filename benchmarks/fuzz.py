@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from configs.arguments import read_arguments
+from configs.arguments import command, read_arguments
 from configs.validate import ConfigError
 from data.interface.actions import ACTIONS, ActionKind
 from data.interface.failures import FAILURES
@@ -335,19 +335,16 @@ def _tallies(config: FuzzConfig) -> Iterator[Tally]:
             yield future.result()
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command()
+def main(arguments: Sequence[str]) -> int:
     """Command line; returns 0 when nothing was wrong, 1 when something was, 2 on wrong arguments."""
     started = time.monotonic()
-    try:
-        config = read_arguments(FuzzConfig, sys.argv[1:] if arguments is None else arguments)
-        robots, rooms = config.robots or available_robots(), config.rooms or room_names()
-        for names, known, what in ((robots, available_robots(), "robot"), (rooms, room_names(), "room")):
-            unknown = [name for name in names if name not in known]
-            if unknown:
-                raise ConfigError(f"unknown {what} {unknown[0]!r}; allowed: {', '.join(known)}")
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+    config = read_arguments(FuzzConfig, arguments)
+    robots, rooms = config.robots or available_robots(), config.rooms or room_names()
+    for names, known, what in ((robots, available_robots(), "robot"), (rooms, room_names(), "room")):
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            raise ConfigError(f"unknown {what} {unknown[0]!r}; allowed: {', '.join(known)}")
     tally = fuzz(config)
     seconds = time.monotonic() - started
     sys.stdout.write(
@@ -358,4 +355,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

@@ -7,9 +7,10 @@ eval.py are Hydra's (`configs.app`).
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import yaml
@@ -17,9 +18,26 @@ import yaml
 from configs.help import asks_for_help, tool_help
 from configs.validate import ConfigError, allowed_values, build
 
-__all__ = ["dispatch", "read_arguments", "read_named"]
+__all__ = ["command", "dispatch", "read_arguments", "read_named"]
 
 T = TypeVar("T")
+
+
+def command(*errors: type[Exception]) -> Callable[[Callable[[Sequence[str]], int]], Callable[[Sequence[str]], int]]:
+    """Decorates a tool's `main`: a ConfigError, or one of `errors`, is printed and ends it with exit code 2."""
+
+    def decorate(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str]], int]:
+        @functools.wraps(main)
+        def guarded(arguments: Sequence[str]) -> int:
+            try:
+                return main(arguments)
+            except (ConfigError, *errors) as error:
+                sys.stderr.write(f"{error}\n")
+                return 2
+
+        return guarded
+
+    return decorate
 
 
 def read_arguments(cls: type[T], arguments: Sequence[str]) -> T:

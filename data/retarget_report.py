@@ -9,7 +9,6 @@ Paper: none.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,9 +18,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from configs.arguments import read_arguments
+from configs.arguments import command, read_arguments
 from configs.schema.checks import require
-from configs.validate import ConfigError
 from data.generator import generate_clip
 from data.metrics import Metrics, evaluate
 from data.omomo import find_demo_clips, level_parts, load_mocap, load_omomo
@@ -128,13 +126,10 @@ class RetargetReport:
         require(self.clips > 0, f"clips={self.clips}: at least 1")
 
 
+@command()
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 2 on wrong arguments."""
-    try:
-        options = read_arguments(RetargetReport, arguments)
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+    options = read_arguments(RetargetReport, arguments)
     count, physics = options.clips, options.physics
     real = [load_omomo(path) for path in find_demo_clips() if path.suffix == ".pt"]
     level = [part for path in find_demo_clips() if path.suffix == ".npy" for part in level_parts(load_mocap(path))]

@@ -24,9 +24,8 @@ from typing import Literal
 
 from transformers.utils import logging as transformers_logging
 
-from configs.arguments import read_arguments
+from configs.arguments import command, read_arguments
 from configs.schema.backend import BackendConfig
-from configs.validate import ConfigError
 from proprio_mllm.backends.local import LocalChat
 from proprio_mllm.backends.protocol import BackendSetupError
 from proprio_mllm.backends.server import ChatServer
@@ -73,13 +72,10 @@ class ServeConfig:
         )
 
 
+@command()
 def main(arguments: Sequence[str]) -> int:
     """Command line; returns the exit code."""
-    try:
-        cfg = read_arguments(ServeConfig, arguments)
-    except ConfigError as error:
-        sys.stderr.write(f"serve: {error}\n")
-        return 2
+    cfg = read_arguments(ServeConfig, arguments)
     transformers_logging.disable_progress_bar()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the block below, as Ctrl-C does
     with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as stack:

@@ -39,6 +39,7 @@ __all__ = [
     "RunnableSession",
     "Stats",
     "Watcher",
+    "answer",
     "episode_steps",
     "run_episode",
 ]
@@ -145,21 +146,23 @@ def run_episode(
         The record; on any exception one with the outcome `INFRASTRUCTURE_ERROR` and the error's text.
     """
     episode = episode_steps(open_session, fields, instruction, step_budget, episode_seed, watch)
+    said: PlannerReply | Exception | None = None
     try:
-        request = next(episode)
         while True:
-            try:
-                answer = None
-                if isinstance(request, Begin):
-                    planner.reset(request.task, request.rng)
-                else:
-                    answer = planner.step(request.observation, request.feedback)
-            except Exception as error:  # noqa: BLE001  # what breaks in the planner is recorded by the episode
-                request = episode.throw(error)
-            else:
-                request = episode.send(answer)
+            said = answer(planner, episode.throw(said) if isinstance(said, Exception) else episode.send(said))
     except StopIteration as end:
         return end.value
+
+
+def answer(planner: Planner, request: Begin | Ask) -> PlannerReply | Exception | None:
+    """What a planner says to a request, or the error it meets; None once it has begun."""
+    try:
+        if isinstance(request, Begin):
+            planner.reset(request.task, request.rng)
+            return None
+        return planner.step(request.observation, request.feedback)
+    except Exception as error:  # noqa: BLE001  # handed to the episode that it belongs to, which records it
+        return error
 
 
 def episode_steps(

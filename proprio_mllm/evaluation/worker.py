@@ -27,6 +27,7 @@ from proprio_mllm.evaluation.episode import (
     Episode,
     EpisodeKeyFields,
     RunnableSession,
+    answer,
     episode_steps,
 )
 from proprio_mllm.planners.bars import without_bar
@@ -262,7 +263,7 @@ class _Alone:
         """Answers it."""
         for one in running.values():
             if one.request is not None:
-                one.go_on(_answer(self._planner, one.request))
+                one.go_on(answer(self._planner, one.request))
 
     def close(self) -> None:
         """Holds nothing."""
@@ -281,8 +282,8 @@ class _Together:
                 one.begin(self._planner)
         asked = [one for one in running.values() if isinstance(one.request, Ask)]
         seen = [one.request.observation for one in asked if isinstance(one.request, Ask)]
-        for one, answer in zip(asked, answer_all(self._planner, seen, [one.state for one in asked]), strict=True):
-            one.go_on(answer)
+        for one, reply in zip(asked, answer_all(self._planner, seen, [one.state for one in asked]), strict=True):
+            one.go_on(reply)
 
     def close(self) -> None:
         """Holds nothing."""
@@ -301,7 +302,7 @@ class _Threads:
         for slot in sorted(set(running) - set(self._asked.values())):
             request = running[slot].request
             if request is not None:
-                self._asked[self._pool.submit(_answer, self._planners[slot], request)] = slot
+                self._asked[self._pool.submit(answer, self._planners[slot], request)] = slot
         if any(one.record is not None for one in running.values()):
             return  # what has ended makes room before anybody is waited for
         for future in wait(self._asked, return_when=FIRST_COMPLETED).done:
@@ -355,17 +356,6 @@ class _Chats:
     def close(self) -> None:
         """Closes the backend."""
         self._backend.close()
-
-
-def _answer(planner: Planner, request: Begin | Ask) -> PlannerReply | Exception | None:
-    """What a planner says, or the error it meets."""
-    try:
-        if isinstance(request, Begin):
-            planner.reset(request.task, request.rng)
-            return None
-        return planner.step(request.observation, request.feedback)
-    except Exception as error:  # noqa: BLE001  # handed to the episode that it belongs to, which records it
-        return error
 
 
 def _broken(result: EpisodeResult) -> bool:

@@ -22,8 +22,7 @@ from typing import Any, Final
 import numpy as np
 from tqdm import tqdm
 
-from configs.arguments import read_arguments
-from configs.validate import ConfigError
+from configs.arguments import command, read_arguments
 from data.files import file_hash, new_folder, write_text
 from data.interface.observation import HistoryItem
 from data.interface.steps import PlanStep
@@ -231,14 +230,11 @@ def _write_images(path: Path, vision: str, reader: ShardReader, chosen: Sequence
     return Features(vision, weights_digest(vision), file_hash(path))
 
 
+@command(MemoryFileError, ShardError, SightError)
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 2 on wrong arguments or what cannot be read."""
-    try:
-        config = read_arguments(MemoryConfig, arguments)
-        memory = build_memory(config, " ".join(["python -m proprio_mllm memory", *arguments]))
-    except (ConfigError, MemoryFileError, ShardError, SightError) as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+    config = read_arguments(MemoryConfig, arguments)
+    memory = build_memory(config, " ".join(["python -m proprio_mllm memory", *arguments]))
     families = {episode.family for episode in memory.episodes}
     robots = Counter(episode.robot for episode in memory.episodes)
     steps = sum(len(episode.steps) for episode in memory.episodes)

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from configs.arguments import read_named
-from configs.validate import ConfigError
+from configs.arguments import command, read_named
 from data.shards import ShardError
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.reconstruction import chosen_pairs, draw_reconstruction
@@ -33,13 +32,10 @@ class PictureConfig:
     out: str = "outputs/look/reconstruction.png"
 
 
+@command()
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 1 when an input is missing, 2 on wrong arguments."""
-    try:
-        (folder, shards), config = read_named(PictureConfig, arguments, ("TOKENIZER", "CLIPS"))
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+    (folder, shards), config = read_named(PictureConfig, arguments, ("TOKENIZER", "CLIPS"))
     out = Path(config.out)
     try:
         tokenizer, clips = MotionTokenizer.load(folder), Clips(Path(shards))

@@ -24,8 +24,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from configs.arguments import read_named
-from configs.validate import ConfigError
+from configs.arguments import command, read_named
 from data.files import write_text
 from data.joint_angles import JointAngles
 from data.omomo import demo_motions
@@ -178,15 +177,13 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
+@command()
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 1 when an input is missing, 2 on wrong arguments."""
+    folders, options = read_named(Options, arguments, ("TOKENIZER",), more=True)
     try:
-        folders, options = read_named(Options, arguments, ("TOKENIZER",), more=True)
         tokenizers = {folder: MotionTokenizer.load(folder) for folder in folders}
         clips = Clips(Path(options.clips))
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
     except (ShardError, FileNotFoundError, ValueError) as error:
         sys.stderr.write(f"{error}\n")
         return 1

@@ -29,8 +29,7 @@ from typing import Any, Final, Literal
 from tqdm import tqdm
 
 import sim
-from configs.arguments import read_arguments
-from configs.validate import ConfigError
+from configs.arguments import command, read_arguments
 from data.files import write_text
 from data.workers import start_worker
 from sim.benchmark.certificates import (
@@ -320,13 +319,10 @@ class BenchmarkConfig:
     tried: str = ""
 
 
+@command()
 def main(arguments: Sequence[str]) -> int:
     """Command line; returns the exit code: 0, 1 when the files differ or slots stay empty, 2 for unknown arguments."""
-    try:
-        options = read_arguments(BenchmarkConfig, arguments)
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+    options = read_arguments(BenchmarkConfig, arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if options.do == "table":
         sys.stdout.write(certificates_table(load_benchmark(), load_certificates()))

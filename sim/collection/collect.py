@@ -21,9 +21,8 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from configs.arguments import read_arguments
+from configs.arguments import command, read_arguments
 from configs.schema.collect import CollectConfig
-from configs.validate import ConfigError
 from data.shards import Manifest, ShardWriter, config_hash
 from data.workers import start_worker
 
@@ -129,13 +128,10 @@ def _with_bar(run: Callable[[Callable[[int, int], None]], Manifest], title: str)
         return run(lambda done, total: bar.update(task, completed=done, total=total))
 
 
+@command()
 def main(arguments: Sequence[str]) -> int:
     """Command line; returns the exit code."""
-    try:
-        config = read_arguments(CollectConfig, arguments)
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+    config = read_arguments(CollectConfig, arguments)
     manifest = _with_bar(lambda report: collect(config, report), config.kind)
     facts: Mapping[str, Any] = {"rows": manifest.rows, "parts": len(manifest.parts), "config_hash": manifest.config_hash}
     sys.stdout.write(f"{config.out}: {facts}\n")

@@ -20,9 +20,8 @@ from sim.tasks.drafts import Draft, Scene
 
 __all__ = ["TextFacts", "TextObject"]
 
-#: Actions after which food on a running heat source is cooked, and width from which two hands find room. Chosen by hand.
+#: Actions after which food on a running heat source is cooked. Chosen by hand.
 _COOKING_ACTIONS: Final = 2
-_BROAD_M: Final = 0.2
 #: Start states under AI2-THOR's names, as conditions.
 _STARTS: Final = {
     "isOpen": Condition.OPEN,
@@ -40,7 +39,7 @@ class TextObject:
         self.object_id, self.kind, self._facts = object_id, kind, facts
         self.movable = object_id in facts.objs
         self.pickupable = self.movable and kind.pickupable
-        self.liftable = max(kind.size[:2]) >= _BROAD_M
+        self.liftable = kind.broad
         self.receptacle, self.openable, self.toggleable = kind.receptacle, kind.openable, kind.toggleable
         self.sliceable, self.consumable, self.fillable = kind.has("sliceable"), kind.has("used_up"), kind.fillable
         self.cutter, self.wiper, self.unsteady = kind.has("cutter"), kind.has("wiper"), kind.has("unsteady")
@@ -169,8 +168,7 @@ class TextFacts:
         """By how much its weight, with its liquid, exceeds what one or two arms carry."""
         item = self.objects[object_id]
         mass = self._mass_kg.get(object_id, item.kind.mass or 0.0) + (item.kind.volume_l if item.filled else 0.0)
-        limit = self._robot.two_arm_max_load_kg if arms == 2 else min(arm.max_load_kg for arm in self._robot.arms.values())
-        return mass - limit
+        return mass - self._robot.max_load_kg(arms)
 
     def outlet(self, object_id: str) -> str | None:
         """What a liquid comes out of there."""

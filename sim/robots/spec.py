@@ -166,6 +166,10 @@ class RobotSpec:
         if not 0.0 < low < high:
             raise ValueError(f"pelvis height range {self.pelvis_height_range_m} is empty")
 
+    def max_load_kg(self, arms: int) -> float:
+        """Heaviest object that both arms carry, or one arm alone, whichever it is."""
+        return self.two_arm_max_load_kg if arms == 2 else min(arm.max_load_kg for arm in self.arms.values())
+
 
 def available_robots() -> tuple[str, ...]:
     """Names of the robots, the user's included."""

@@ -23,30 +23,28 @@ _OPENED: Final = 0.6
 _CLOSED: Final = 0.06
 #: Share of a vessel's volume from which on it is full. Chosen by hand.
 FULL_SHARE: Final = 0.999
-#: Width or depth from which on two hands find room on an object, metres. Chosen by hand.
-_BROAD_M: Final = 0.2
 
 
 class WorldObject:
     """An object of the simulator as `data.interface.facts.ObjectFacts`."""
 
     def __init__(self, obj: ObjectInstance, body: Body) -> None:
-        self._thing, self._body = obj, body
+        self._obj, self._body = obj, body
 
     @property
     def object_id(self) -> str:
         """`Type_1`."""
-        return self._thing.object_id
+        return self._obj.object_id
 
     @property
     def movable(self) -> bool:
         """Whether it has a free joint."""
-        return self._thing.movable
+        return self._obj.movable
 
     @property
     def pickupable(self) -> bool:
         """Whether its type is made for one hand."""
-        return self._thing.type.pickupable
+        return self._obj.type.pickupable
 
     @property
     def two_handed(self) -> bool:
@@ -56,112 +54,112 @@ class WorldObject:
     @property
     def liftable(self) -> bool:
         """Whether it is broad enough for two hands."""
-        return max(self._thing.type.size[:2]) >= _BROAD_M
+        return self._obj.type.broad
 
     @property
     def receptacle(self) -> bool:
         """Whether it has a supporting surface."""
-        return self._thing.type.receptacle
+        return self._obj.type.receptacle
 
     @property
     def openable(self) -> bool:
         """Whether it has a door, a drawer or a lid."""
-        return bool(self._thing.moving)
+        return bool(self._obj.moving)
 
     @property
     def toggleable(self) -> bool:
         """Whether it has a switch."""
-        return self._thing.toggle_site >= 0
+        return self._obj.toggle_site >= 0
 
     @property
     def sliceable(self) -> bool:
         """Whether a knife cuts it."""
-        return self._thing.type.has("sliceable")
+        return self._obj.type.has("sliceable")
 
     @property
     def consumable(self) -> bool:
         """Whether there is something in it to use up."""
-        return self._thing.type.has("used_up")
+        return self._obj.type.has("used_up")
 
     @property
     def fillable(self) -> bool:
         """Whether it holds a liquid."""
-        return self._thing.type.fillable
+        return self._obj.type.fillable
 
     @property
     def cutter(self) -> bool:
         """Whether it is a knife."""
-        return self._thing.type.has("cutter")
+        return self._obj.type.has("cutter")
 
     @property
     def wiper(self) -> bool:
         """Whether it is a sponge or towel."""
-        return self._thing.type.has("wiper")
+        return self._obj.type.has("wiper")
 
     @property
     def unsteady(self) -> bool:
         """Whether it rolls or slides away under a tool."""
-        return self._thing.type.has("unsteady")
+        return self._obj.type.has("unsteady")
 
     @property
     def holders(self) -> Collection[str]:
         """The arms that hold it, in the order of grasping."""
-        return self._thing.held_by
+        return self._obj.held_by
 
     @property
     def opened(self) -> bool:
         """Whether it is open as far as Open opens it."""
-        return self._thing.openness > _OPENED
+        return self._obj.openness > _OPENED
 
     @property
     def closed(self) -> bool:
         """Whether it is closed as far as Close closes it."""
-        return self._thing.openness < _CLOSED
+        return self._obj.openness < _CLOSED
 
     @property
     def shut(self) -> bool:
         """Whether what it carries is out of reach."""
-        return self._thing.is_shut
+        return self._obj.is_shut
 
     @property
     def covered(self) -> bool:
         """Whether its switch lies under a lid that is down."""
-        return self._thing.type.lidded and not self._thing.is_open
+        return self._obj.type.lidded and not self._obj.is_open
 
     @property
     def on(self) -> bool:
         """Whether it is switched on."""
-        return self._thing.is_toggled
+        return self._obj.is_toggled
 
     @property
     def sliced(self) -> bool:
         """Whether it has been sliced."""
-        return self._thing.state.isSliced
+        return self._obj.state.isSliced
 
     @property
     def soiled(self) -> bool:
         """Whether it is dirty, or a puddle is on it."""
-        return self._thing.state.isDirty or any(puddle.surface == self.object_id for puddle in self._body.world.liquids.puddles)
+        return self._obj.state.isDirty or any(puddle.surface == self.object_id for puddle in self._body.world.liquids.puddles)
 
     @property
     def used_up(self) -> bool:
         """Whether nothing is left in it."""
-        return self._thing.state.isUsedUp
+        return self._obj.state.isUsedUp
 
     @property
     def broken(self) -> bool:
         """Whether it is broken."""
-        return self._thing.is_broken
+        return self._obj.is_broken
 
     @property
     def filled(self) -> bool:
         """Whether there is a liquid in it."""
-        return self._thing.state.fillLitres > 0.0
+        return self._obj.state.fillLitres > 0.0
 
     @property
     def full(self) -> bool:
         """Whether no more liquid goes in."""
-        return self._thing.state.fillLitres >= FULL_SHARE * self._thing.type.volume_l
+        return self._obj.state.fillLitres >= FULL_SHARE * self._obj.type.volume_l
 
 
 class WorldFacts:
@@ -192,9 +190,7 @@ class WorldFacts:
 
     def overload_kg(self, object_id: str, arms: int) -> float:
         """By how much its weight with contents exceeds what two arms, or the weaker of the arms alone, carry."""
-        spec = self._body.spec
-        limit = spec.two_arm_max_load_kg if arms == 2 else min(arm.max_load_kg for arm in spec.arms.values())
-        return self._body.world.containment.total_mass_kg(object_id) - limit
+        return self._body.world.containment.total_mass_kg(object_id) - self._body.spec.max_load_kg(arms)
 
     def outlet(self, object_id: str) -> str | None:
         """What a liquid comes out of there: itself, or the tap of a basin."""

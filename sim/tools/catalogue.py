@@ -15,8 +15,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from configs.arguments import read_arguments
-from configs.validate import ConfigError
+from configs.arguments import command, read_arguments
 from data.interface.actions import ACTIONS
 from data.interface.failures import FAILURES
 from sim.interfaces.aliases import ALIASES
@@ -159,14 +158,11 @@ class CatalogueConfig:
     json: bool = False
 
 
+@command()
 def main(arguments: Sequence[str]) -> int:
     """Prints the inventory; returns the exit code."""
-    try:
-        wanted = read_arguments(CatalogueConfig, arguments)
-        parts = inventory()
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+    wanted = read_arguments(CatalogueConfig, arguments)
+    parts = inventory()
     if wanted.json:
         sys.stdout.write(json.dumps(parts, indent=1) + "\n")
     else:

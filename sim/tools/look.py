@@ -16,8 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from configs.arguments import read_arguments
-from configs.validate import ConfigError
+from configs.arguments import command, read_arguments
 from data.interface.bodies import DEFAULT_ROBOT
 from data.interface.steps import Action, PlanStep
 from sim.expert.expert import Expert
@@ -144,13 +143,10 @@ class LookConfig:
     out: str = "outputs/look"
 
 
+@command()
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 2 on wrong arguments."""
-    try:
-        config = read_arguments(LookConfig, arguments)
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+    config = read_arguments(LookConfig, arguments)
     for written in draw_all(Path(config.out)):
         sys.stdout.write(f"{written}\n")
     return 0

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter1d
 
-from configs.arguments import read_named
+from configs.arguments import command, read_named
 from configs.schema.checks import require
-from configs.validate import ConfigError, allowed_values
+from configs.validate import allowed_values
 from data.generator import generate_clip
 from data.humanml3d import DatasetError, load_clip
 from data.motion import FPS
@@ -266,13 +266,10 @@ class MotionConfig:
             require(name in available_robots(), f"robots: {allowed_values(name, available_robots())}")
 
 
+@command()
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 1 when a clip cannot be used, 2 on wrong arguments."""
-    try:
-        names, config = read_named(MotionConfig, arguments, ("CLIP",), more=True)
-    except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+    names, config = read_named(MotionConfig, arguments, ("CLIP",), more=True)
     retargeters = [Retargeter(load_robot(name)) for name in config.robots or available_robots()]
     for name in names:
         try:

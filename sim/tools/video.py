@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from configs.arguments import read_arguments
+from configs.arguments import command, read_arguments
 from configs.validate import ConfigError
 from data.interface.bodies import DEFAULT_ROBOT
 from data.interface.steps import ActionError, PlanStep
@@ -207,13 +207,10 @@ def _act(session: Session, step: PlanStep, video: VideoRecorder) -> bool:
     return feedback.success
 
 
+@command(ActionError, ValueError)
 def main(arguments: Sequence[str]) -> int:
     """Command line; returns 0 when every step succeeded, 1 when one failed, 2 on wrong arguments."""
-    try:
-        config = read_arguments(VideoConfig, arguments)
-        frames, fine = film(config)
-    except (ConfigError, ActionError, ValueError) as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
+    config = read_arguments(VideoConfig, arguments)
+    frames, fine = film(config)
     sys.stdout.write(f"{config.out}: {frames} frames, {frames / config.fps:.1f} s{'' if fine else ', a step failed'}\n")
     return 0 if fine else 1

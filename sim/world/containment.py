@@ -71,5 +71,5 @@ class Containment:
 
     def needs_two_hands(self, object_id: str) -> bool:
         """Whether its type or its present weight asks for both hands."""
-        limit = min(arm.max_load_kg for arm in self._scene.the_robot().arms.values())
+        limit = self._scene.the_robot().max_load_kg(1)
         return self._scene.object(object_id).type.two_handed or self.total_mass_kg(object_id) > limit

@@ -85,7 +85,7 @@ def test_the_tiny_model_is_served(view: Callable[..., ChatImage]) -> None:
 @pytest.mark.parametrize(
     ("argument", "code", "message"),
     [
-        ("port=70000", 2, "serve: ServeConfig: port 70000 outside [0, 65535]"),
+        ("port=70000", 2, "ServeConfig: port 70000 outside [0, 65535]"),
         ("batch=0", 2, "batch 0 outside [1, 1024]"),
         ("model=x", 2, "model: unknown key; allowed: batch, constrained, device, dtype, port, weights"),
         ("weights=nowhere", 1, "serve: nowhere: not a checkpoint"),

@@ -10,10 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
 
-from sim.robots.spec import load_robot
 from tests.extension.additions import QUANTIZER, SKILL, STAGE, Addition
+from tests.third_robot import write_third_robot
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("configs", "data", "sim", "proprio_mllm")
@@ -63,15 +62,8 @@ def test_what_the_map_lists_is_enough(addition: Addition, tmp_path: Path) -> Non
 
 @pytest.fixture
 def assets(tmp_path: Path) -> Path:
-    """A third robot: the shorter one of the paper under another name, with a lighter load."""
-    model = load_robot("x1")
-    description = Path(model.mjcf_path).parents[2] / "specs" / "x1.yaml"
-    values = yaml.safe_load(description.read_text(encoding="utf-8"))
-    folder = tmp_path / "assets" / "robots"
-    folder.mkdir(parents=True)
-    (folder / "stubby.xml").write_text(model.mjcf_path.read_text(encoding="utf-8"), encoding="utf-8")
-    values |= {"name": "stubby", "mjcf": "stubby.xml", "two_arm_max_load_kg": 6.0}
-    (folder / "stubby.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
+    """A folder with a third robot."""
+    write_third_robot(tmp_path / "assets")
     return tmp_path / "assets"
 
 

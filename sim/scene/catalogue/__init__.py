@@ -65,6 +65,8 @@ MATERIALS: Final = (
     "Metal", "Wood", "Plastic", "Glass", "Ceramic", "Stone", "Fabric", "Rubber", "Food", "Paper", "Wax", "Soap", "Sponge",
     "Organic", "Leather",
 )  # fmt: skip
+#: Width or depth from which on two hands find room on an object, metres. Chosen by hand.
+_BROAD_M: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,6 +277,11 @@ class ObjectType:
     def movable(self) -> bool:
         """Whether it can be lifted, with one hand or two."""
         return "pickupable" in self.properties or "two_handed" in self.properties
+
+    @property
+    def broad(self) -> bool:
+        """Whether two hands find room on it."""
+        return max(self.size[:2]) >= _BROAD_M
 
     @property
     def volume_l(self) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import yaml
 
 from configs.assets import ASSETS_VARIABLE
 from configs.compose import compose
@@ -17,6 +16,7 @@ from sim.scene.catalogue import load_catalogue
 from sim.scene.rooms import load_room, room_names
 from sim.session.contingency import load_contingency
 from sim.session.session import FreePlay, Session
+from tests.third_robot import write_third_robot
 
 TEAPOT = """
 version: 1
@@ -52,17 +52,12 @@ rules:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    for kind in ("rooms", "types", "robots", "contingency"):
+    for kind in ("rooms", "types", "contingency"):
         (tmp_path / kind).mkdir()
     (tmp_path / "types" / "crockery.yaml").write_text(TEAPOT)
     (tmp_path / "rooms" / "pantry.yaml").write_text(PANTRY)
     (tmp_path / "contingency" / "unlucky.yaml").write_text(UNLUCKY)
-    x1 = load_robot("x1")
-    description = Path(x1.mjcf_path).parents[2] / "specs" / "x1.yaml"
-    values = yaml.safe_load(description.read_text(encoding="utf-8"))
-    (tmp_path / "robots" / "stubby.xml").write_text(x1.mjcf_path.read_text(encoding="utf-8"), encoding="utf-8")
-    values |= {"name": "stubby", "mjcf": "stubby.xml", "two_arm_max_load_kg": 6.0}
-    (tmp_path / "robots" / "stubby.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
+    write_third_robot(tmp_path)
     monkeypatch.setenv(ASSETS_VARIABLE, str(tmp_path))
     return tmp_path
 
