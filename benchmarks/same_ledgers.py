@@ -41,7 +41,7 @@ def first_difference(old: dict[str, Any], new: dict[str, Any]) -> str:
 
 def main() -> int:
     """Prints differing episodes and a count per planner and robot."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("old", type=Path)
     parser.add_argument("new", type=Path)
     options = parser.parse_args()

@@ -41,13 +41,12 @@ Rooms, objects, textures, motions, captions, tasks and weights are made by this 
 def licence_of(distribution: metadata.Distribution) -> str:
     """The licence as the package declares it: expression, then classifier, then the first line of the free text."""
     fields = distribution.metadata
-    expression = fields.get("License-Expression")
-    if expression:
-        return expression
+    if "License-Expression" in fields:
+        return fields["License-Expression"]
     classifiers = [c.split("::")[-1].strip() for c in fields.get_all("Classifier") or [] if c.startswith("License ::")]
     if classifiers:
         return ", ".join(classifiers)
-    text = (fields.get("License") or "").strip().splitlines()
+    text = "".join(fields.get_all("License") or []).strip().splitlines()
     return text[0][:60] if text else "see its own files"
 
 
