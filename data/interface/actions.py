@@ -71,7 +71,7 @@ class ActionSpec:
         tool: what the acting hand has to hold, None when it needs no tool.
         beside: actions of the other arm that may be about the same object at the same time.
         requires: preconditions in the order in which they are checked.
-        effects: what holds after it has succeeded.
+        effects: what holds after it has succeeded; none for what changes nothing that anybody asks about.
         meets: failure codes that only moving tells.
     """
 

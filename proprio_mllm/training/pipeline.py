@@ -38,7 +38,7 @@ class Stage(Protocol):
         name: as in `stage=NAME`; names the output's folder too.
         needs: stages whose current output it starts from; their keys are part of its own.
         shards: kinds of shards whose content is part of its key.
-        recipe: raised when what it trains on changes in code, so that older output is not taken for current.
+        recipe: raised when what it trains on changes in code, so that older output is not taken for current; starts at 0.
     """
 
     @property
@@ -51,7 +51,7 @@ class Stage(Protocol):
     def recipe(self) -> int: ...
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
-        """What of the configuration its output depends on, as plain values."""
+        """What of the configuration its output depends on, as plain values; empty for nothing besides seed and inputs."""
         ...
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:

@@ -63,7 +63,8 @@ def shard_hash(folder: Path) -> str:
     try:
         complete = Manifest.load(Path(folder)).complete
     except ShardError as error:
-        raise ShardError(f"{error}; make them with `python train.py stage=data` and `stage=collect`") from error
+        stage = "data" if Path(folder).name == "clips" else "collect"
+        raise ShardError(f"{error}; make them with `python train.py stage={stage}`") from error
     if not complete:
         raise ShardError(f"{folder}: its producer has not finished; run the same command again to continue it")
     return hashlib.sha256((Path(folder) / "manifest.json").read_bytes()).hexdigest()[:16]

@@ -321,6 +321,8 @@ class TextWorld:
             "Clean": item.soiled, "UseUp": item.consumable, "Pour": item.fillable and item.movable,
             "Fill": self.facts.outlet(item.object_id) is not None,
         }  # fmt: skip
+        others = (spec for spec in ACTIONS.values() if spec.takes_object and spec.tool is None and not spec.has_effect(PutDown))
+        suits |= {spec.name: True for spec in others if spec.name not in suits}
         verb = self._pick_one([name for name, fits in suits.items() if fits])
         arm = self._any_arm() if ACTIONS[verb].kind is ActionKind.ARM else None
         return Action(verb, arm=arm, object_id=item.object_id)

@@ -2,7 +2,7 @@
 
 The hand goes to the handle until it touches it, then leads it along the door's arc or the drawer's slide; a ball joint at the
 grasp stands for the fingers around the bar. Where the arm cannot follow all the way, the robot steps back with it. A door or
-drawer is shut by pushing its outside (`sim.skills.push`), by its handle only where that does not work. What counts is the
+drawer is shut by pushing its outside (`sim.skills.push_door`), by its handle only where that does not work. What counts is the
 joint's position afterwards. A switch flips when a finger touches it.
 
 Paper: Open and Toggle of the DualTHOR action space; Close is ours.
@@ -32,7 +32,7 @@ from sim.skills.locomotion import sweep
 from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, stow
 from sim.skills.navigation import Stance
 from sim.skills.plan_cache import cached_plan
-from sim.skills.push import Push, plan_push, push_shut
+from sim.skills.push_door import Push, plan_push, push_shut
 from sim.skills.reach import Reach, diagnosed, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import Skill, wait

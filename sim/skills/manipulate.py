@@ -34,7 +34,6 @@ from sim.skills.runner import CONTROL_DT_S, Skill, wait
 __all__ = [
     "OutcomeDraw",
     "grip",
-    "nudge",
     "pick",
     "place",
     "plan_bring",
@@ -42,6 +41,7 @@ __all__ = [
     "plan_place",
     "reset_arm",
     "retreat",
+    "shift_hand",
     "stow",
     "upright",
 ]
@@ -166,7 +166,7 @@ def _level_way(body: Body, arm: Arm, held: str, goal: Array) -> list[Array]:
 _NUDGE_RAD: Final = 0.6
 
 
-def nudge(body: Body, arm: Arm, change: Array) -> Skill:
+def shift_hand(body: Body, arm: Arm, change: Array) -> Skill:
     """Moves the hand by a small way in the world, as far as the arm can."""
     position, hand = body.arms.hand_pose(arm)
     goal = body.ik.solve(arm, HandPose(position + change, hand[:, 0], hand[:, 1]), start=body.arms.commanded(arm))
@@ -218,7 +218,7 @@ def pick(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Pick: takes an object with one hand and carries it before the body.
 
     Raises:
-        SkillFailure: what `check_pick` and `plan_pick` refuse, GraspMissed, Dropped, or a contingency.
+        SkillFailure: what `assess_pick` refuses, GraspMissed, Dropped, or a contingency.
     """
     grasp, reach = assess_pick(body, action)
     arm = action.arm
@@ -376,7 +376,7 @@ def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Place: puts the held object down on a free spot of a receptacle.
 
     Raises:
-        SkillFailure: what `check_place` and `plan_place` refuse, PlaceMissed, or a contingency.
+        SkillFailure: what `assess_place` refuses, PlaceMissed, or a contingency.
     """
     _, reach, away = assess_place(body, action)
     arm = action.arm
@@ -411,7 +411,7 @@ def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     if outcome == "broken":
         raise SkillFailure(FailureCode.BROKE, contingency=outcome)
     if receptacle.object_id not in body.world.containment.parents(obj.object_id):
-        gap = float(np.linalg.norm(body.objects.center(obj.object_id) - body.objects.center(receptacle.object_id)))
+        gap = float(np.linalg.norm(body.world.poses.center(obj.object_id) - body.world.poses.center(receptacle.object_id)))
         raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})
 
 

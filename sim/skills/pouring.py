@@ -23,7 +23,7 @@ from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
 from sim.skills.facts import FULL_SHARE, WorldFacts, require
 from sim.skills.failures import SkillFailure
-from sim.skills.manipulate import OutcomeDraw, nudge, plan_bring, stow
+from sim.skills.manipulate import OutcomeDraw, plan_bring, shift_hand, stow
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
 from sim.skills.runner import CONTROL_DT_S, Skill, wait
@@ -212,7 +212,7 @@ def fill(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
         aside = np.array([point[0] - top[0], point[1] - top[1], 0.0])
         if float(np.hypot(aside[0], aside[1])) < _CENTRED_M:
             break
-        yield from nudge(body, arm, aside)
+        yield from shift_hand(body, arm, aside)
     for _ in range(int(_LONGEST_S / CONTROL_DT_S)):
         if vessel.state.fillLitres >= full or body.hands.held[arm] != vessel.object_id or outcome == "nothing":
             break

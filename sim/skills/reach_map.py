@@ -51,7 +51,7 @@ class HandPose:
     """A target for the hand.
 
     Attributes:
-        position: (3,) grasp site in the pelvis frame, metres.
+        position: (3,) grasp site, metres; in the frame of who asks: the world for skills, the pelvis here.
         pointing: (3,) unit direction of the fingers (site x), or None for any.
         closing: (3,) unit closing direction (site y), or None for any.
         either_way: whether the opposite closing direction is as good.

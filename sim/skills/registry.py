@@ -14,7 +14,7 @@ from sim.skills.body.body import Body
 from sim.skills.facts import WorldFacts
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import OutcomeDraw
-from sim.skills.push import Push
+from sim.skills.push_door import Push
 from sim.skills.runner import Skill, refuse
 
 __all__ = ["BODY_SKILLS", "SKILLS", "ArmSkill", "assess_action", "excludes", "skills_for"]

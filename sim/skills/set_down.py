@@ -269,5 +269,5 @@ def place_both(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
             break
         yield
     if receptacle.object_id not in body.world.containment.parents(obj.object_id):
-        gap = float(np.linalg.norm(body.objects.center(obj.object_id) - body.objects.center(receptacle.object_id)))
+        gap = float(np.linalg.norm(body.world.poses.center(obj.object_id) - body.world.poses.center(receptacle.object_id)))
         raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})

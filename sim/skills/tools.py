@@ -23,7 +23,7 @@ from sim.skills.articulate import plan_press
 from sim.skills.body.body import Body
 from sim.skills.facts import require
 from sim.skills.failures import SkillFailure
-from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, nudge, plan_bring, stow
+from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, plan_bring, shift_hand, stow
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
 from sim.skills.runner import Skill, wait
@@ -175,14 +175,14 @@ def _apply(
     for _ in range(_PRESS_STEPS):
         if gap <= 0.5 * GRASP_GAP_M:
             break
-        yield from nudge(body, arm, np.array([0.0, 0.0, -_PRESS_M]))
+        yield from shift_hand(body, arm, np.array([0.0, 0.0, -_PRESS_M]))
         gap = body.probe.gap_m(mine, theirs)
     outcome = outcome_draw(action)
     if gap <= GRASP_GAP_M and outcome == "success":
         along = body.posture.turn_to_world(np.array([1.0, 0.0, 0.0]))
         for _ in range(_STROKES):
-            yield from nudge(body, arm, _STROKE_M * along)
-            yield from nudge(body, arm, -_STROKE_M * along)
+            yield from shift_hand(body, arm, _STROKE_M * along)
+            yield from shift_hand(body, arm, -_STROKE_M * along)
         effect(obj)
         yield from _leave(body, arm, reach, tool)
         return

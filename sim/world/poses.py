@@ -30,8 +30,9 @@ class ObjectPoses:
 
     def center(self, object_id: str) -> NDArray[np.float64]:
         """(3,) centre of the bounding box."""
-        low, high = self.bounds(object_id)
-        return (low + high) / 2.0
+        item = self._scene.object(object_id)
+        rotation = self._scene.data.xmat[item.body_id].reshape(3, 3)
+        return self._scene.data.xpos[item.body_id] + rotation @ (0.5 * (item.local_min + item.local_max))
 
     def bounds(self, object_id: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Axis-aligned bounding box (minimum, maximum), doors closed."""

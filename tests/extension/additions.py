@@ -30,12 +30,13 @@ class Edit:
 
 @dataclass(frozen=True)
 class Addition:
-    """Everything that is changed for one thing, its name, and a program that uses it and prints `works`."""
+    """What is changed for one thing, its name, a program that uses it and prints `works`, and tests that must still pass."""
 
     row: str
     name: str
     edits: tuple[Edit, ...]
     program: str
+    checks: tuple[str, ...] = ()
 
 
 SKILL = Addition(
@@ -146,6 +147,7 @@ assert "ok" in codes, codes
 assert set(codes) <= {"ok", *ACTIONS["Tap"].codes}, codes
 print("works")
 """,
+    ("tests/data/interface", "tests/sim/collection/test_text_planning.py", "tests/planners/chat/dag_plan/test_checks.py"),
 )
 
 QUANTIZER = Addition(

@@ -15,7 +15,7 @@ from tests.extension.additions import QUANTIZER, SKILL, STAGE, Addition
 from tests.third_robot import write_third_robot
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("configs", "data", "sim", "proprio_mllm")
+PACKAGES = ("configs", "data", "sim", "proprio_mllm", "tests")
 
 
 def touched(row: str, name: str) -> set[str]:
@@ -54,7 +54,7 @@ def test_what_the_map_lists_is_enough(addition: Addition, tmp_path: Path) -> Non
     assert done.stdout.endswith("works\n"), done.stderr[-3000:]
     own = next(edit.path for edit in addition.edits if edit.path.startswith("tests/"))
     checked = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", own], cwd=root,
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", own, *addition.checks], cwd=root,
         env=os.environ | {"PYTHONPATH": str(root)}, capture_output=True, text=True,
     )  # fmt: skip
     assert checked.returncode == 0, checked.stdout[-2000:]

@@ -19,17 +19,11 @@ class ObjectGeometry:
     def __init__(self, world: World) -> None:
         self._world = world
 
-    def center(self, object_id: str) -> Array:
-        """(3,) centre of an object's bounding box in the world."""
-        obj = self._world.objects[object_id]
-        rotation = self._world.data.xmat[obj.body_id].reshape(3, 3)
-        return self._world.data.xpos[obj.body_id] + rotation @ (0.5 * (obj.local_min + obj.local_max))
-
     def interaction_point(self, object_id: str) -> Array:
         """(3,) world point that a robot who goes to an object wants before it: handle, inside, switch or centre."""
         obj = self._world.objects[object_id]
         if obj.movable and obj.type.lidded:  # to lift it as well as to open it
-            return self.center(object_id)
+            return self._world.poses.center(object_id)
         if obj.is_shut and obj.moving[0].handle_site >= 0:
             return self._world.data.site_xpos[obj.moving[0].handle_site].copy()
         if obj.type.encloses:
@@ -38,7 +32,7 @@ class ObjectGeometry:
             return self._world.data.xpos[surface.body_id] + self._world.data.xmat[surface.body_id].reshape(3, 3) @ local
         if obj.toggle_site >= 0 and not obj.type.pickupable:
             return self._world.data.site_xpos[obj.toggle_site].copy()
-        return self.center(object_id)
+        return self._world.poses.center(object_id)
 
     def faces_rad(self, object_id: str) -> tuple[float, ...]:
         """World directions out of an object in which a robot stands well: square to what carries it, or to its own sides."""

@@ -10,7 +10,7 @@ from sim.session.session import FreePlay, Session
 from sim.skills.articulate import assess_open_close
 from sim.skills.body.ready import ready_posture
 from sim.skills.door import Door
-from sim.skills.push import Push
+from sim.skills.push_door import Push
 
 NAME = "Drawer_1"
 
@@ -52,13 +52,13 @@ def test_the_front_of_a_drawer_is_where_its_geometry_says(session):
 @pytest.mark.parametrize("arm", Arm)
 def test_a_drawer_that_stands_wide_open_is_pushed_shut(session, arm):
     body = start(session, 1.0)
-    inside = body.objects.center("CellPhone_1") - session.world.poses.handle(NAME)
+    inside = body.world.poses.center("CellPhone_1") - session.world.poses.handle(NAME)
     assert act(session, f"GoTo({NAME})").success
     assert isinstance(assess_open_close(body, Action("Close", arm=arm, object_id=NAME)), Push)
     outcome = act(session, f"Close({arm}, {NAME})")
     assert outcome.success, outcome
     assert session.world.objects[NAME].openness < 0.02
-    assert np.linalg.norm(body.objects.center("CellPhone_1") - session.world.poses.handle(NAME) - inside) < 0.03
+    assert np.linalg.norm(body.world.poses.center("CellPhone_1") - session.world.poses.handle(NAME) - inside) < 0.03
     assert all(np.allclose(body.arms.commanded(each), ready_posture(body.kit, each), atol=1e-6) for each in Arm)
     assert act(session, f"Close({arm}, {NAME})").code == "AlreadyInState"
 

@@ -14,7 +14,7 @@ from sim.skills.body.ready import ready_posture
 from sim.skills.failures import SkillFailure
 from sim.skills.navigation import Stance
 from sim.skills.plan_cache import cached_plan
-from sim.skills.push import Push
+from sim.skills.push_door import Push
 from sim.skills.runner import refuse, run_skills
 from sim.skills.set_down import assess_place_both
 from sim.world.metadata import world_metadata
@@ -92,14 +92,14 @@ def close_with_some_arm(session, door):
 
 def stands_as_before(session, before):
     """Whether no movable object was moved by more than 3 cm and both arms are home."""
-    moved = [name for name, place in before.items() if np.linalg.norm(session.body.objects.center(name)[:2] - place[:2]) > 0.03]
+    moved = [name for name, place in before.items() if np.linalg.norm(session.world.poses.center(name)[:2] - place[:2]) > 0.03]
     home = all(np.allclose(session.body.arms.commanded(arm), ready_posture(session.body.kit, arm), atol=1e-6) for arm in Arm)
     return not moved and home
 
 
 def places(session, door):
     others = (name for name, obj in session.world.objects.items() if obj.movable and name != door)
-    return {name: session.body.objects.center(name) for name in others}
+    return {name: session.world.poses.center(name) for name in others}
 
 
 @pytest.mark.parametrize("door", ["Microwave_1", "Cabinet_1", "Fridge_1"])

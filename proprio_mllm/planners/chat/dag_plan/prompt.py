@@ -9,15 +9,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+from data.interface.actions import ACTIONS
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
+from proprio_mllm.planners.chat.dag_plan.checks import KINDS
 from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.chat.reflection import Seen, changed_text, completed_steps, failed_text
 from proprio_mllm.planners.chat.view import scene_text
 
 __all__ = ["GRAPH_FORM", "GRAPH_RULES", "REVISED_FORM", "failure_text", "graph_text", "mending_text"]
 
-GRAPH_RULES: Final = """\
+_OPERATE: Final = ", ".join(name for name in KINDS["operate"] if ACTIONS[name].arms == 1 and ACTIONS[name].takes_object)
+GRAPH_RULES: Final = f"""\
 Write what has to be done as a graph. A scheduler carries it out with both arms, at the same time where it can: it chooses the
 arms, walks to the object of each node, and looks for objects that have not been seen. A node is one action of the grammar with
 its arm left out, such as Pick(Mug_1), Place(CounterTop_1), Release() or Lift(Pot_1). Its fields:
@@ -27,7 +30,7 @@ its arm left out, such as Pick(Mug_1), Place(CounterTop_1), Release() or Lift(Po
   occupy, full afterwards: Pick, Hold, Lift, and Open of a door that falls shut unless the hand stays at it
   release, empty again: Place, Release, PlaceBoth
   tool-use, works with what it holds: Slice, Clean, Pour, Fill
-  operate, empty before and after: Open, Close, ToggleOn, ToggleOff, UseUp; and all movements of the body
+  operate, empty before and after: {_OPERATE}; and all movements of the body
   complete, the end of the task: Done
 - arms: 2 for Lift and PlaceBoth, otherwise 1
 - after: ids of the nodes that have to be done before, and no others: what does not wait is done at the same time
@@ -36,7 +39,7 @@ its arm left out, such as Pick(Mug_1), Place(CounterTop_1), Release() or Lift(Po
 Rules:
 - Every occupy is followed by a release of its item, and between the two that item is only used as a tool. What shall stay in
   the hand at the end has a complete node after its occupy instead of a release.
-- There are two hands. Open, Close, ToggleOn, ToggleOff and UseUp need an empty one.
+- There are two hands. {" and ".join(_OPERATE.rsplit(", ", 1))} need an empty one.
 - A hand that Holds something or stays at a door keeps the robot there: pick up first what it needs.
 - Furniture goes by the ids of the message. A small thing that has not been seen goes by its type and a number, such as Mug_1,
   if the task names it.
