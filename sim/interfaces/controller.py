@@ -31,6 +31,7 @@ from sim.scene.rooms import load_room
 from sim.session.session import FreePlay, Session, SessionSnapshot, TaskLike
 from sim.skills.navigation import wrap_angle
 from sim.world.metadata import world_metadata
+from sim.world.rendering import MAX_SIZE
 
 __all__ = ["THOR_CODES", "Controller", "Event"]
 
@@ -109,13 +110,14 @@ class Controller:
     Args:
         robot_type: robot name.
         scene: room name.
-        width, height: size of the frames; both must agree.
+        width, height: size of the frames.
         difficulty: easy, medium, hard or natural.
         seed: key of the trial's luck.
         third_party_cameras: names of `sim.world.rendering.CAMERAS` drawn with every event.
         privileged: allows TP, GetInteractablePoses, SetObjectPoses and InitialRandomSpawn.
         task: start from a task instead of the room's default.
         contingency: name of the outcome distributions (`configs/contingency`, or one's own assets).
+        all_known: whether actions may name any object, seen or not.
         undo_limit: how many steps Undo goes back; each takes about a megabyte.
 
     Attributes:
@@ -123,7 +125,7 @@ class Controller:
         last_event: the latest event.
 
     Raises:
-        ValueError: when width and height differ.
+        ValueError: on a frame without pixels, or larger than 1280.
     """
 
     def __init__(
@@ -139,11 +141,13 @@ class Controller:
         task: TaskLike | None = None,
         undo_limit: int = 100,
         contingency: str = "default",
+        all_known: bool = False,
     ) -> None:
-        if width != height:
-            raise ValueError(f"frames are square, got width {width} and height {height}")
-        self.session = Session(robot_type, difficulty, width, contingency)
-        self._size, self._seed = width, seed
+        for side, value in (("width", width), ("height", height)):
+            if not 1 <= value <= MAX_SIZE:
+                raise ValueError(f"{side} {value} outside 1..{MAX_SIZE}")
+        self.session = Session(robot_type, difficulty, min(width, height), contingency, all_known=all_known)
+        self._shape, self._seed = (height, width), seed
         self._cameras, self._privileged = tuple(third_party_cameras), privileged
         self._task: TaskLike = FreePlay(scene) if task is None else task
         self._undo: deque[SessionSnapshot] = deque(maxlen=undo_limit)
@@ -318,12 +322,15 @@ class Controller:
         return [{"objectId": placement.object_id, "receptacle": placement.receptacle} for placement in placements]
 
     def _teleport(self, call: Mapping[str, Any]) -> bool:
-        position = call.get("position", {})
+        position, rotation = call.get("position", {}), call.get("rotation", 0.0)
         if not isinstance(position, Mapping):
             raise ValueError(f"TP: position must be a mapping with x and y, got {str(position)[:80]!r}")
         x, y = (number("TP", axis, call.get(axis, position.get(axis, 0.0))) for axis in "xy")
-        rotation = call.get("rotation", 0.0)
-        if isinstance(rotation, Mapping):  # AI2-THOR: degrees about each axis
+        if isinstance(rotation, Mapping):  # degrees about each axis, z up
+            if rotation.get("x") or rotation.get("y"):
+                raise ValueError(
+                    f"TP: rotation {dict(rotation)} must be about z, which is up here; sim.interfaces.thor has y up"
+                )
             rotation = rotation.get("z", 0.0)
         yaw = wrap_angle(float(np.deg2rad(np.remainder(number("TP", "rotation", rotation), 360.0))))
         body = self.session.body
@@ -336,7 +343,7 @@ class Controller:
 
     def _event(self, name: str, outcomes: tuple[ActionOutcome, ...], result: Any) -> Event:
         session = self.session
-        view = session.world.cameras.render("head", self._size, self._size, depth=True, segmentation=True)
+        view = session.world.cameras.render("head", *self._shape, depth=True, segmentation=True)
         assert view.depth is not None and view.segmentation is not None
         failed = [outcome for outcome in outcomes if not outcome.success]
         metadata = world_metadata(session.world)
@@ -353,8 +360,8 @@ class Controller:
             "margins": dict(failed[0].margins) if failed else {},
             "errorMessage": "; ".join(f"{outcome.action.to_text()}: {outcome.message}" for outcome in failed),
             "actionReturn": result,
-            "screenWidth": self._size,
-            "screenHeight": self._size,
+            "screenWidth": self._shape[1],
+            "screenHeight": self._shape[0],
             "fov": float(session.world.model.camera(session.robot.head_camera).fovy[0]),
             "collided": any(outcome.code == FailureCode.BLOCKED_PATH for outcome in failed),
             "results": [
@@ -379,7 +386,7 @@ class Controller:
             depth_frame=view.depth,
             instance_segmentation_frame=colors[view.segmentation],
             color_to_object_id={(int(r), int(g), int(b)): names[i] for i, (r, g, b) in enumerate(palette)},
-            third_party_camera_frames=[session.world.cameras.render(c, self._size, self._size).rgb for c in self._cameras],
+            third_party_camera_frames=[session.world.cameras.render(c, *self._shape).rgb for c in self._cameras],
         )
 
 

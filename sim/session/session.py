@@ -32,7 +32,7 @@ from sim.skills.body.body import Body
 from sim.skills.body.ready import ready_posture
 from sim.skills.failures import SkillFailure
 from sim.skills.registry import assess_action, skills_for
-from sim.skills.runner import CONTROL_DT_S, run_skills
+from sim.skills.runner import CONTROL_DT_S, Skill, run_skills
 from sim.world.metadata import world_metadata
 from sim.world.snapshot import WorldSnapshot
 from sim.world.world import World
@@ -259,10 +259,19 @@ class Session:
         return feedback
 
     def _run(self, step: PlanStep, diagnose: bool) -> Feedback:
+        known = frozenset(self.known_objects)
+        return self.perform(skills_for(self.body.assuming(diagnose=diagnose), step, known, self.draw), step.to_text())
+
+    def perform(self, skills: Sequence[tuple[Action, Skill]], text: str) -> Feedback:
+        """Runs skills together. By themselves they are no step of a plan: privileged, for front ends with motions of their own.
+
+        Args:
+            skills: coroutines, each with the action that it counts as.
+            text: what watchers are told.
+        """
         started = self.world.time_s
-        skills = skills_for(self.body.assuming(diagnose=diagnose), step, frozenset(self.known_objects), self.draw)
         place = self.body.base.measured().position
-        path, text = 0.0, step.to_text()
+        path = 0.0
 
         def advance() -> None:
             nonlocal place, path

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.world.placement import REACH_BAND_M, find_free_spot, resting_on
+from sim.world.placement import REACH_BAND_M, above_surfaces, find_free_spot
 from sim.world.scene_state import SceneState
 
 __all__ = ["Containment"]
@@ -25,7 +25,8 @@ class Containment:
 
     def all_parents(self) -> dict[str, tuple[str, ...]]:
         """Receptacles of every movable object, the direct one first, then what carries that one."""
-        direct = resting_on(self._scene.data, self._scene.objects)
+        found = above_surfaces(self._scene.data, self._scene.objects)
+        direct = {name: above[0] for name, above in found.items() if above}
         chains: dict[str, tuple[str, ...]] = {}
         for name in direct:
             chain: list[str] = []

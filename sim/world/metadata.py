@@ -6,9 +6,11 @@ AI2-THOR's, plus `heldBy` (arms that hold the object), `center`, `temperatureCel
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.scene.objects import ObjectInstance
 from sim.world.placement import box_in_world
@@ -17,6 +19,8 @@ from sim.world.world import World
 __all__ = ["object_metadata", "temperature_name", "world_metadata"]
 
 
+Array = NDArray[np.float64]
+_CORNERS: Final = np.array([(i, j, k) for i in (0.0, 1.0) for j in (0.0, 1.0) for k in (0.0, 1.0)])
 #: A pelvis that is lower than standing by more than this is crouching, metres.
 _STANDING_M: Final = 0.05
 
@@ -32,7 +36,7 @@ def object_metadata(world: World, obj: ObjectInstance, parents: tuple[str, ...],
     """One object's record."""
     kind, state = obj.type, obj.state
     low, high = box_in_world(world.data, obj)
-    position = world.data.xpos[obj.body_id]
+    position, rotation = world.data.xpos[obj.body_id], world.data.xmat[obj.body_id].reshape(3, 3)
     center = (low + high) / 2.0
     entry: dict[str, Any] = {
         "objectId": obj.object_id,
@@ -40,7 +44,7 @@ def object_metadata(world: World, obj: ObjectInstance, parents: tuple[str, ...],
         "objectType": kind.name,
         "position": _xyz(position),
         "center": _xyz(center),
-        "rotation": _euler(world, obj),
+        "rotation": _euler(rotation),
         "distance": world.servos.distance_to((low, high)),
         "receptacle": kind.receptacle,
         "toggleable": kind.toggleable,
@@ -73,12 +77,12 @@ def object_metadata(world: World, obj: ObjectInstance, parents: tuple[str, ...],
         "isColdSource": kind.has("cold_source"),
         "temperature": temperature_name(state.temperature),
         "temperatureCelsius": state.temperature,
-        "mass": world.containment.total_mass_kg(obj.object_id) if obj.movable else 0.0,
+        "mass": sum(world.objects[name].laden_mass_kg for name in (obj.object_id, *contents)) if obj.movable else 0.0,
         "salientMaterials": list(kind.materials),
         "parentReceptacles": list(parents),
         "receptacleObjectIds": list(contents),
         "axisAlignedBoundingBox": {"center": _xyz(center), "size": _xyz(high - low)},
-        "objectOrientedBoundingBox": {"cornerPoints": _corners(world, obj)},
+        "objectOrientedBoundingBox": {"cornerPoints": _corners(obj, position, rotation)},
     }
     return entry
 
@@ -132,18 +136,14 @@ def _xyz(values: Any) -> dict[str, float]:
     return {"x": float(values[0]), "y": float(values[1]), "z": float(values[2])}
 
 
-def _corners(world: World, obj: ObjectInstance) -> list[list[float]]:
+def _corners(obj: ObjectInstance, position: Array, rotation: Array) -> list[list[float]]:
     """Eight corners of the box in the object's own axes, world frame, metres."""
-    ends = (obj.local_min, obj.local_max)
-    local = np.array([[ends[i][0], ends[j][1], ends[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-    rotation = world.data.xmat[obj.body_id].reshape(3, 3)
-    return (local @ rotation.T + world.data.xpos[obj.body_id]).tolist()
+    local = obj.local_min + _CORNERS * (obj.local_max - obj.local_min)
+    return (local @ rotation.T + position).tolist()
 
 
-def _euler(world: World, obj: ObjectInstance) -> dict[str, float]:
+def _euler(m: Array) -> dict[str, float]:
     """Roll, pitch, yaw in degrees (rotations about x, y, z, in that order, in the world)."""
-    m = world.data.xmat[obj.body_id].reshape(3, 3)
-    roll = np.degrees(np.arctan2(m[2, 1], m[2, 2]))
-    pitch = np.degrees(np.arcsin(np.clip(-m[2, 0], -1.0, 1.0)))
-    yaw = np.degrees(np.arctan2(m[1, 0], m[0, 0]))
-    return {"x": float(roll), "y": float(pitch), "z": float(yaw)}
+    roll = math.degrees(math.atan2(m[2, 1], m[2, 2]))
+    pitch = math.degrees(math.asin(min(max(-float(m[2, 0]), -1.0), 1.0)))
+    return {"x": roll, "y": pitch, "z": math.degrees(math.atan2(m[1, 0], m[0, 0]))}

@@ -5,7 +5,7 @@ Pure geometry on the current poses. World frame in and out, metres. Paper: recep
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 import mujoco
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sim.scene.catalogue import ObjectType
 from sim.scene.objects import ObjectInstance, Surface
 
-__all__ = ["OVERHANG_SHARE", "REACH_BAND_M", "box_in_world", "find_free_spot", "fits_on", "resting_on"]
+__all__ = ["OVERHANG_SHARE", "REACH_BAND_M", "above_surfaces", "box_in_world", "boxes_in_world", "find_free_spot", "fits_on"]
 
 #: Depth from a receptacle's reachable edge within which objects are put.
 REACH_BAND_M: Final = 0.35
@@ -33,6 +33,16 @@ def box_in_world(data: mujoco.MjData, obj: ObjectInstance) -> tuple[NDArray[np.f
     return center - half, center + half
 
 
+def boxes_in_world(data: mujoco.MjData, objects: Sequence[ObjectInstance]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N, 3) minima and maxima of `box_in_world` of several objects."""
+    bodies = [obj.body_id for obj in objects]
+    low, high = np.array([obj.local_min for obj in objects]), np.array([obj.local_max for obj in objects])
+    rotations = data.xmat[bodies].reshape(-1, 3, 3)
+    center = data.xpos[bodies] + np.einsum("nij,nj->ni", rotations, (low + high) / 2.0)
+    half = np.einsum("nij,nj->ni", np.abs(rotations), (high - low) / 2.0)
+    return center - half, center + half
+
+
 def fits_on(kind: ObjectType, place: ObjectType) -> bool:
     """Whether an object can stand on a surface of a type, in any orientation, with its whole footprint."""
     radius, height = float(np.hypot(kind.size[0], kind.size[1])) / 2.0, kind.size[2]
@@ -47,11 +57,6 @@ def _is_hollow(obj: ObjectInstance) -> bool:
 def _to_world(data: mujoco.MjData, surface: Surface, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 3) points of the type's frame in the world."""
     return data.xpos[surface.body_id] + (points - surface.origin) @ data.xmat[surface.body_id].reshape(3, 3).T
-
-
-def _to_surface(data: mujoco.MjData, surface: Surface, point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3,) world point in the type's frame of the body that carries the surface."""
-    return data.xmat[surface.body_id].reshape(3, 3).T @ (point - data.xpos[surface.body_id]) + surface.origin
 
 
 def find_free_spot(
@@ -86,7 +91,8 @@ def find_free_spot(
         (3,) world point on the surface, or None when there is no room.
     """
     skip = {receptacle.object_id, *ignore}
-    boxes = [box_in_world(data, obj) for name, obj in objects.items() if name not in skip]
+    others = [obj for name, obj in objects.items() if name not in skip]
+    lows, highs = boxes_in_world(data, others) if others else (np.zeros((0, 3)), np.zeros((0, 3)))
     found: list[NDArray[np.float64]] = []
     for surface in receptacle.surfaces:
         spec = surface.spec
@@ -98,15 +104,16 @@ def find_free_spot(
         if not len(points):
             continue
         world = _to_world(data, surface, points)
-        free = np.ones(len(world), dtype=bool)
-        for low, high in boxes:
-            if high[2] < world[0, 2] - 0.005 or low[2] > world[0, 2] + height_m:
-                continue
-            # what carries the receptacle itself does not block: its top is below the surface
-            if high[2] <= world[0, 2] + 0.004:
-                continue
-            outside = np.maximum(np.maximum(low[:2] - world[:, :2], world[:, :2] - high[:2]), 0.0)
-            free &= np.hypot(outside[:, 0], outside[:, 1]) >= radius_m + gap_m
+        top = world[0, 2]
+        # what carries the receptacle itself does not block: its top is below the surface
+        level = (highs[:, 2] > top + 0.004) & (lows[:, 2] <= top + height_m)
+        reach = radius_m + gap_m
+        level &= np.all(
+            (lows[:, :2] <= world[:, :2].max(axis=0) + reach) & (highs[:, :2] >= world[:, :2].min(axis=0) - reach), axis=1
+        )
+        near_lows, near_highs = lows[level, None, :2], highs[level, None, :2]
+        outside = np.maximum(np.maximum(near_lows - world[:, :2], world[:, :2] - near_highs), 0.0)  # (B, P, 2)
+        free = np.all(np.hypot(outside[..., 0], outside[..., 1]) >= reach, axis=0)
         if free.any():
             found.append(world[free])
             if spec.inside and near is None:
@@ -144,40 +151,38 @@ def _candidates(receptacle: ObjectInstance, surface: Surface, radius_m: float, b
     return np.column_stack([grid, np.full(len(grid), surface.spec.z)])
 
 
-def resting_on(data: mujoco.MjData, objects: Mapping[str, ObjectInstance]) -> dict[str, str]:
-    """Direct carrier of every movable object that rests on or in a surface.
+def above_surfaces(data: mujoco.MjData, objects: Mapping[str, ObjectInstance]) -> dict[str, tuple[str, ...]]:
+    """Receptacles that every movable object is on or in by position, the highest surface first.
 
-    An object rests on a surface when its middle is above the rectangle and its lowest point is at the surface (3 cm, or 6 mm
-    while a hand holds it), or, for hollow receptacles, below the rim. The highest such surface wins, so an apple in a bowl on a
+    An object is on a surface when its middle is above the rectangle and its lowest point is at the surface (3 cm, or 6 mm
+    while a hand holds it), or, for hollow receptacles, below the rim. The highest one carries it, so an apple in a bowl on a
     table belongs to the bowl.
     """
-    carriers: dict[str, str] = {}
     surfaces = [(obj, surface) for obj in objects.values() for surface in obj.surfaces]
-    for name, obj in objects.items():
-        if not obj.movable:
-            continue
-        low, high = box_in_world(data, obj)
-        bottom = np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])
-        best = -np.inf
-        for receptacle, surface in surfaces:
-            if receptacle is obj:
-                continue
-            if (
-                abs(data.xpos[receptacle.body_id, 0] - bottom[0]) > 1.6
-                or abs(data.xpos[receptacle.body_id, 1] - bottom[1]) > 1.6
-            ):
-                continue
-            x, y, z = _to_surface(data, surface, bottom)
-            cx, cy, sx, sy = surface.spec.rect
-            margin = 0.02 if _is_hollow(receptacle) else 0.05
-            if abs(x - cx) > sx / 2.0 + margin or abs(y - cy) > sy / 2.0 + margin:
-                continue
-            heap = _is_hollow(receptacle) and (receptacle.type.lidded or not surface.spec.inside)
-            reach = 0.6 * surface.spec.clearance if heap else 0.03
-            if obj.held_by:
-                reach = 0.006
-            level = float(data.xpos[surface.body_id, 2] - surface.origin[2] + surface.spec.z)
-            if -0.02 <= z - surface.spec.z <= reach and level > best:
-                best = level
-                carriers[name] = receptacle.object_id
-    return carriers
+    if not surfaces:
+        return {}
+    owners = [obj.object_id for obj, _ in surfaces]
+    bodies = np.array([surface.body_id for _, surface in surfaces])
+    rects = np.array([surface.spec.rect for _, surface in surfaces])
+    origins = np.array([surface.origin for _, surface in surfaces])
+    heights = np.array([surface.spec.z for _, surface in surfaces])
+    hollow = np.array([_is_hollow(obj) for obj, _ in surfaces])
+    heaps = hollow & np.array([obj.type.lidded or not surface.spec.inside for obj, surface in surfaces])
+    reach = np.where(heaps, 0.6 * np.array([surface.spec.clearance for _, surface in surfaces]), 0.03)
+    margin = np.where(hollow, 0.02, 0.05)[:, None]
+    levels = data.xpos[bodies, 2] - origins[:, 2] + heights
+    turns = data.xmat[bodies].reshape(-1, 3, 3)
+    movable = [obj for obj in objects.values() if obj.movable]
+    if not movable:
+        return {}
+    lows, highs = boxes_in_world(data, movable)
+    bottoms = np.column_stack([(lows[:, :2] + highs[:, :2]) / 2.0, lows[:, 2]])
+    found: dict[str, tuple[str, ...]] = {}
+    for obj, bottom in zip(movable, bottoms, strict=True):
+        local = np.einsum("sji,sj->si", turns, bottom - data.xpos[bodies]) + origins
+        within = np.all(np.abs(local[:, :2] - rects[:, :2]) <= rects[:, 2:] / 2.0 + margin, axis=1)
+        rise = local[:, 2] - heights
+        carries = np.flatnonzero(within & (rise >= -0.02) & (rise <= (0.006 if obj.held_by else reach)))
+        best = carries[np.argsort(-levels[carries], kind="stable")]
+        found[obj.object_id] = tuple(dict.fromkeys(owners[k] for k in best if owners[k] != obj.object_id))
+    return found

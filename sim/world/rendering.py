@@ -22,11 +22,13 @@ from sim.world.poses import ObjectPoses
 from sim.world.scene_state import SceneState
 from sim.world.servos import Servos
 
-__all__ = ["CAMERAS", "Cameras", "Renderer", "RenderingError", "View", "camera_intrinsics", "camera_pose"]
+__all__ = ["CAMERAS", "MAX_SIZE", "Cameras", "Renderer", "RenderingError", "View", "camera_intrinsics", "camera_pose"]
 
 CAMERAS: Final = ("head", "front", "left", "right", "behind", "top", "overview", "plan")
 MAX_SIZE: Final = 1280
 _MAX_GEOMS: Final = 1500
+#: A camera of the room that stands in for one that is put somewhere for a picture.
+_FREE: Final = "overview"
 #: A geom group that is not drawn.
 _UNSEEN_GROUP: Final = 5
 #: Cameras that go with the robot around it; they stay before the furniture.
@@ -223,6 +225,29 @@ class Cameras:
     ) -> View:
         """Draws a camera of `CAMERAS`."""
         return self._renderer(height, width).view(camera, depth=depth, segmentation=segmentation)
+
+    def render_from(self, pose: NDArray[np.float64], fovy_deg: float, height: int = 112, width: int = 112) -> NDArray[np.uint8]:
+        """(H, W, 3) picture of a camera that stands anywhere.
+
+        Args:
+            pose: (4, 4) of the camera in the world, x right, y down, z forward.
+            fovy_deg: its vertical field of view.
+            height: rows.
+            width: columns.
+        """
+        model, data, index = self._scene.model, self._scene.data, _camera_id(self._scene, _FREE)
+        owners = ((model, "cam_pos"), (model, "cam_quat"), (model, "cam_fovy"), (data, "cam_xpos"), (data, "cam_xmat"))
+        before = [getattr(owner, name)[index].copy() for owner, name in owners]
+        rotation, quaternion = pose[:3, :3] * np.array([1.0, -1.0, -1.0]), np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+        values = (pose[:3, 3], quaternion, fovy_deg, pose[:3, 3], rotation.ravel())  # MuJoCo leaves cameras of the room alone
+        try:
+            for (owner, name), value in zip(owners, values, strict=True):
+                getattr(owner, name)[index] = value
+            return self._renderer(height, width).view(_FREE).rgb
+        finally:
+            for (owner, name), value in zip(owners, before, strict=True):
+                getattr(owner, name)[index] = value
 
     def labels(self, camera: str = "head", height: int = 112, width: int = 112) -> NDArray[np.int32]:
         """(H, W) segmentation of a camera as in `View`, for less than half of what a picture with it costs."""

@@ -30,12 +30,14 @@ class Servos:
     def __init__(self, scene: SceneState, recorder: Recorder | None) -> None:
         self._scene, self._recorder = scene, recorder
         self._actuator = {scene.model.actuator(i).name: i for i in range(scene.model.nu)}
+        robot = () if scene.robot is None else (*BASE_JOINTS, *scene.robot.joints)
+        self._position = {name: int(scene.model.joint(name).qposadr[0]) for name in robot}
+        self._base = [self._position[name] for name in BASE_JOINTS[:4] if robot]
 
     @property
     def base_pose(self) -> NDArray[np.float64]:
         """(4,) x, y, pelvis height (m) and yaw (rad) of the base."""
-        model, data = self._scene.model, self._scene.data
-        return np.array([data.qpos[model.joint(name).qposadr[0]] for name in BASE_JOINTS[:4]])
+        return self._scene.data.qpos[self._base]
 
     @property
     def base_target(self) -> NDArray[np.float64]:
@@ -76,8 +78,8 @@ class Servos:
 
     def joint_positions(self) -> dict[str, float]:
         """Positions of all joints of the robot, by name."""
-        model, data = self._scene.model, self._scene.data
-        return {name: float(data.qpos[model.joint(name).qposadr[0]]) for name in self._scene.the_robot().joints}
+        data = self._scene.data
+        return {name: float(data.qpos[self._position[name]]) for name in self._scene.the_robot().joints}
 
     def set_hand(self, arm: str, opening: float) -> None:
         """Commands a hand, 0 closed to 1 open."""

@@ -117,8 +117,10 @@ def test_unknown_actions_and_arguments(controller):
         controller.step("Undo", steps=2)
     with pytest.raises(ValueError, match="arm 'third' is not left or right"):
         to_action("pick", {"objectId": "Mug_1", "arm": "third"})
-    with pytest.raises(ValueError, match="width 100 and height 90"):
-        Controller("h1", "kitchen_1", width=100, height=90)
+    with pytest.raises(ValueError, match=r"width 0 outside 1\.\.1280"):
+        Controller("h1", "kitchen_1", width=0, height=90)
+    with pytest.raises(ValueError, match="must be about z, which is up"):
+        controller.step("Teleport", position={"x": 0.0, "y": 0.0, "z": 0.9}, rotation={"x": 0, "y": 90, "z": 0})
 
 
 def test_teleport_needs_privilege(controller):
@@ -128,3 +130,12 @@ def test_teleport_needs_privilege(controller):
             controller.step(action="TP", x=0.0, y=0.0)
     finally:
         controller._privileged = True
+
+
+def test_frames_need_not_be_square():
+    made = Controller("x1", "bathroom_1", width=80, height=48, third_party_cameras=("behind",))
+    event = made.step("Pass")
+    assert event.frame.shape == (48, 80, 3) and event.depth_frame.shape == (48, 80)
+    assert event.third_party_camera_frames[0].shape == (48, 80, 3)
+    assert (event.metadata["screenWidth"], event.metadata["screenHeight"]) == (80, 48)
+    made.stop()
