@@ -1,13 +1,14 @@
 """Speed and size of the simulator, every ratio within one run.
 
-    python benchmarks/simulator.py [--out FILE] [--robosuite PYTHON]
+    python benchmarks/simulator.py [--only PART ...] [--out FILE] [--robosuite PYTHON]
 
 * planner's view: 224 pixels of the furnished kitchen with H1, against the same scene with MuJoCo's default quality (shadow
 maps, multisampling, lights that cast shadows) drawn by `mujoco.Renderer`; depth and segmentation against colours alone. *
 skills: simulated seconds per second of one core over a plan with walking, reaching, grasping, placing and a door. * episode: a
-reset in a room that has been compiled; memory: a process with one environment that has acted and rendered. * robosuite: with
-`--robosuite`, the Python of an environment that has robosuite (it needs another MuJoCo), TwoArmLift is stepped in a process of
-its own: real-time factor without a camera, and camera frames per second at 256 pixels, against ours.
+reset in a room that has been compiled; growth: metadata and resets with 10, 40 and 100 objects; memory: a process with one
+environment that has acted and rendered. * robosuite: with `--robosuite`, the Python of an environment that has robosuite (it
+needs another MuJoCo), TwoArmLift is stepped in a process of its own: real-time factor without a camera, and camera frames per
+second at 256 pixels, against ours.
 """
 
 from __future__ import annotations
@@ -28,11 +29,14 @@ import sim.tasks
 from data.interface.steps import PlanStep
 from sim.robots.spec import load_robot
 from sim.scene.compiler import build_spec
+from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 from sim.tasks.task import load_benchmark
+from sim.world.metadata import world_metadata
 from sim.world.scene_state import scene_key
 from sim.world.world import World
 
+ROOM = "kitchen_1"
 CERTIFICATES = Path(sim.tasks.__file__).parent / "certificates.jsonl"
 ROBOSUITE = """
 import json, sys, time
@@ -128,6 +132,49 @@ def skills(robot: str) -> dict[str, float]:
     return {"simulated_s": simulated, "wall_s": wall, "real_time": simulated / wall, "succeeded": done, "steps": steps}
 
 
+def crowded(count: int) -> list[ObjectPlacement]:
+    """That many eggs on the worktops and tables of a kitchen, in rows."""
+    bare = World(None, ROOM, [], settle_s=0.0)
+    egg = bare.catalogue.get("Egg")
+    radius = 0.5 * float(np.hypot(*egg.size[:2]))
+    found: list[ObjectPlacement] = []
+    for name, item in bare.objects.items():
+        for surface in (one for one in item.surfaces if not one.spec.inside):
+            cx, cy, sx, sy = surface.spec.rect
+            grid = np.stack(np.meshgrid(*(np.arange(-0.45 * side, 0.45 * side, 0.13) for side in (sx, sy))), axis=-1).reshape(
+                -1, 2
+            )
+            turn = bare.data.xmat[surface.body_id].reshape(3, 3)[:2, :2]
+            for point in grid + (cx, cy):
+                xy = bare.data.xpos[surface.body_id, :2] + turn @ (point - surface.origin[:2])
+                spot = bare.containment.free_spot(name, radius, height_m=egg.size[2], near=xy, gap_m=0.0, band_m=10.0)
+                if spot is not None and float(np.linalg.norm(spot[:2] - xy)) < 0.02:
+                    found.append(ObjectPlacement(f"Egg_{len(found) + 1}", name, (float(xy[0]), float(xy[1]))))
+                if len(found) == count:
+                    return found
+    raise ValueError(f"{ROOM} has room for {len(found)} eggs, wanted {count}")
+
+
+def growth() -> dict[str, float]:
+    """What metadata and a new world cost with 10, 40 and 100 movable objects; the room's furniture comes on top."""
+    rows: dict[str, float] = {}
+    robot = load_robot("h1")
+    for count in (10, 40, 100):
+        placements = crowded(count)
+        world = World(robot, ROOM, placements)
+
+        def asked(world: World = world) -> Any:
+            world.data.qpos[0] += 1e-9  # nothing is remembered from the last time
+            return world_metadata(world)
+
+        def made(placements: list[ObjectPlacement] = placements) -> Any:
+            return World(robot, ROOM, placements)
+
+        rows[f"metadata_{count}_ms"] = median_ms(asked)
+        rows[f"reset_{count}_ms"] = median_ms(made, count=5, warm=1)
+    return rows
+
+
 def episodes() -> dict[str, float]:
     session = Session("h1", image_size=0)
     task = FreePlay("kitchen_1")
@@ -181,16 +228,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--robosuite", help="Python of an environment with robosuite")
-    arguments = parser.parse_args()
-    rows: dict[str, Any] = {
-        "views": views(),
-        "skills_h1": skills("h1"),
-        "skills_x1": skills("x1"),
-        "episodes": episodes(),
-        "steps": camera_frames(),
-        "memory": memory(),
+    parts: dict[str, Callable[[], dict[str, float]]] = {
+        "views": views,
+        "skills_h1": lambda: skills("h1"),
+        "skills_x1": lambda: skills("x1"),
+        "episodes": episodes,
+        "growth": growth,
+        "steps": camera_frames,
+        "memory": memory,
     }
-    if arguments.robosuite:
+    parser.add_argument("--only", nargs="+", choices=tuple(parts), default=tuple(parts), help="what is measured")
+    arguments = parser.parse_args()
+    rows: dict[str, Any] = {name: parts[name]() for name in arguments.only}
+    if arguments.robosuite and "steps" in rows:
         other = rows["robosuite"] = robosuite(arguments.robosuite)
         rows["against_robosuite"] = {
             "real_time_ratio": rows["steps"]["plain_real_time"] / other["plain"]["real_time"],
