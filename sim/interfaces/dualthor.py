@@ -25,8 +25,9 @@ import imageio.v3 as iio
 import numpy as np
 
 from data.interface.bodies import PAPER_ROBOTS, Arm
+from data.interface.failures import FailureCode
 from data.interface.feedback import ActionOutcome
-from data.interface.steps import PlanStep
+from data.interface.steps import Action, PlanStep
 from sim.interfaces.aliases import to_action
 from sim.interfaces.poses import interactable_poses
 from sim.session.session import FreePlay, Session, SessionSnapshot
@@ -51,6 +52,9 @@ _PREFIX: Final[Mapping[str, str]] = {
 }
 _ID = re.compile(r"^(?:[A-Za-z]+_)?([A-Za-z]+)_0*([1-9][0-9]*)$")
 _REACHABLE_STRIDE: Final = 9
+#: Places that `tp` tries, and refusals that another place may mend.
+_PLACES: Final = 40
+_REACH_CODES: Final = (FailureCode.TOO_FAR, FailureCode.OBSTRUCTED, FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW)
 
 Reply = dict[str, Any]
 
@@ -229,20 +233,32 @@ class Controller:
             body.objects.faces_rad(name),
             body.fits,
         )
+        places: list[tuple[float, float, float, float | None]] = []
         if best is not None:
             stance = best[0]
             within = [h for h in body.ik.heights() if any(body.ik.within(arm, point, h, stance) for arm in Arm)]
-            self.session.teleport(stance.x, stance.y, stance.yaw_rad, max(within, default=None))
-            if within:
+            places += [(stance.x, stance.y, stance.yaw_rad, height) for height in sorted(within, reverse=True)[::2]]
+        near = best[0].position if best is not None else point[:2]
+        poses = interactable_poses(body, name, limit=1000)  # nearer than is comfortable, or from another side
+        poses.sort(key=lambda pose: float(np.hypot(pose.x_m - near[0], pose.y_m - near[1])))
+        places += [(pose.x_m, pose.y_m, float(np.radians(pose.yaw_deg)), pose.pelvis_height_m) for pose in poses]
+        before = self.session.snapshot()
+        for place in places[:_PLACES]:
+            self.session.teleport(*place)
+            if self._serves(name):
                 return self._arrived()
-        poses = interactable_poses(body, name, limit=1000)
-        if poses:  # nearer than is comfortable, or from another side
-            place = best[0].position if best is not None else point[:2]
-            near = min(poses, key=lambda pose: float(np.hypot(pose.x_m - place[0], pose.y_m - place[1])))
-            self.session.teleport(near.x_m, near.y_m, float(np.radians(near.yaw_deg)), near.pelvis_height_m)
-        elif best is None:
-            return self._reply("tp", False, f"there is no place to stand near {call.get('objectID')}")
-        return self._arrived()
+        self.session.restore(before)
+        return self._reply("tp", False, f"nowhere near {call.get('objectID')} could an arm do anything with it")
+
+    def _serves(self, name: str) -> bool:
+        """Whether what can be done with an object is within an arm's reach from here."""
+        obj = self.session.world.objects[name]
+        verbs = ["Pick"] * obj.type.pickupable + ["ToggleOff" if obj.is_toggled else "ToggleOn"] * (obj.toggle_site >= 0)
+        verbs += ["Close" if obj.is_open else "Open"] * bool(obj.moving)
+        actions = [Action(verb, arm=arm, object_id=name) for verb in verbs for arm in Arm]
+        actions += [Action("Lift", object_id=name)] * (obj.movable and not obj.type.pickupable)
+        refused = [self.session.assess(action, diagnose=False) for action in actions]
+        return not actions or any(one is None or one.code not in _REACH_CODES for one in refused)
 
     def _arrived(self) -> Reply:
         self._remember()

@@ -106,3 +106,18 @@ def test_pictures_are_written_when_asked_for(tmp_path: Path) -> None:
     path = Path(made.step("getcurstate")["imgpath"])
     assert path.is_file() and path.parent == tmp_path
     made.stop()
+
+
+def test_tp_says_when_nothing_can_be_reached() -> None:
+    controller = Controller(robot_type="x1", scene="kitchen")
+    before = controller.session.world.data.qpos.copy()
+    reply = controller.step("tp", objectID="Kitchen_Mug_01")  # on a machine at the back of a worktop
+    assert not reply["success"] and "nowhere near Kitchen_Mug_01" in reply["msg"]
+    assert np.array_equal(controller.session.world.data.qpos, before)
+    reached = next(
+        entry["objectId"]
+        for entry in controller.step("getcurstate")["sceneState"]["objects"]
+        if entry["pickupable"] and controller.step("tp", objectID=entry["objectId"])["success"]
+    )
+    assert controller.step("pick", objectID=reached)["success"]
+    controller.stop()
