@@ -136,7 +136,7 @@ def test_a_new_recipe_makes_older_output_stale(trained: Pipeline, monkeypatch: p
 def test_a_stage_names_what_it_needs(trained: Pipeline, tmp_path: Path) -> None:
     (tmp_path / "tiny").mkdir()
     nothing = Pipeline(STAGES, dataclasses.replace(trained.cfg, output=str(tmp_path)), collect)
-    with pytest.raises(ShardError, match=r"no such file.*make them with `python train.py stage=data`"):
+    with pytest.raises(ShardError, match=r"no such file.*make them with `python train.py stage=collect`"):
         nothing.run("base")
     (tmp_path / "tiny" / "data").symlink_to(trained.paths.shards("views").parent, target_is_directory=True)
     with pytest.raises(StageError, match=r"'alignment' needs the output of 'base'; run `python train.py stage=base` first"):
