@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from configs.compose import compose
 from tests.extension.additions import QUANTIZER, SKILL, STAGE, Addition
 from tests.third_robot import write_third_robot
 
@@ -31,6 +32,23 @@ def ran(code: str, root: Path, *arguments: str, **variables: str) -> subprocess.
     return subprocess.run(
         [sys.executable, "-c", code, *arguments], cwd=root, env=environment, capture_output=True, text=True, timeout=280
     )
+
+
+def test_the_keys_that_the_map_names_exist() -> None:
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    commands = [(app, words.split()) for app, words in re.findall(r"`(train|eval)\.py ([^`]+)`", page)]
+    commands += [("train", [word]) for word in re.findall(r"`(model\.[a-z_.]+=NAME)`", page)]
+    assert len(commands) > 8
+    for app, words in commands:
+        settings = [word for word in words if "=" in word]
+        values = compose(app, [word for word in settings if not re.search("[A-Z]{4}", word)])
+        for key in (word.split("=")[0] for word in settings):
+            if (ROOT / "configs" / key).is_dir():  # a group, which may be empty until it is chosen
+                continue
+            found = values
+            for name in key.split("."):
+                assert name in found, f"{app}.py has no {key}"
+                found = found[name]
 
 
 @pytest.mark.parametrize("addition", [SKILL, QUANTIZER, STAGE], ids=lambda addition: addition.name)
