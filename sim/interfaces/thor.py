@@ -60,7 +60,7 @@ UNUSED: Final = (
     "agentMode", "agentCount", "platform", "server_timeout", "local_executable_path", "branch", "commit_id", "quality",
     "x_display", "gpu_device", "headless", "renderDepthImage", "renderInstanceSegmentation", "renderSemanticSegmentation",
     "renderNormalsImage", "visibilityDistance", "snapToGrid", "makeAgentsVisible", "massThreshold", "port", "host",
-    "start_unity", "fastActionEmit", "useMassThreshold", "action",
+    "start_unity", "fastActionEmit", "useMassThreshold",
 )  # fmt: skip
 #: Kinds of rooms by hundreds of AI2-THOR's floor plans.
 _PLANS: Final = {0: "kitchen", 2: "living_room", 3: "bedroom", 4: "bathroom"}
@@ -232,6 +232,7 @@ class Controller:
             "Reset": lambda call: self.reset(**call) and self._own.last_event,
             "Teleport": self._teleport,
             "TeleportFull": self._teleport,
+            "Done": lambda _: self._own.step("Pass"),  # the plan grammar's ends the episode
             "Crouch": lambda _: self._to_height(self.session.robot.pelvis_height_range_m[0]),
             "Stand": lambda _: self._to_height(self.session.robot.standing_pelvis_height_m),
             "GetReachablePositions": self._reachable,
@@ -292,7 +293,7 @@ class Controller:
         if target == "Pick" and known and self.session.world.containment.needs_two_hands(object_id):
             return [Action("Lift", object_id=object_id)]
         if call.get("arm"):
-            return [Action(target, arm=Arm(str(call["arm"]).lower()), object_id=object_id)]
+            return [Action(target, arm=_arm(call), object_id=object_id)]
         busy = spec.tool is not None or spec.name in ("Place", "Release")
         arms = [arm for arm in (Arm.RIGHT, Arm.LEFT) if (held[arm] is not None) == busy] or [Arm.RIGHT]
         return [Action(target, arm=arm, object_id=object_id) for arm in arms]
@@ -406,14 +407,15 @@ class Controller:
         point = from_thor(call.get("position", place))
         yaw = yaw_from_thor(call["rotation"]) if call.get("rotation") is not None else float(now[3])
         seen = float(self._own.last_event.metadata["agent"]["cameraHorizon"])
-        if call.get("horizon") is not None and abs(number("Teleport", "horizon", call["horizon"]) - seen) > 1.0:
-            return self._failed("Teleport", f"horizon {call['horizon']}: the head camera is fixed at {seen:.0f}")
+        wanted = number("Teleport", "horizon", call["horizon"]) if call.get("horizon") is not None else seen
         if session.body.hands.at_furniture() or not session.body.workspace.navigation().is_free(point[:2]):
             return self._failed("Teleport", f"the robot cannot stand at {to_thor(point)}")
         event = self._own.step("TP", x=float(point[0]), y=float(point[1]), rotation=float(np.degrees(yaw)))
         if call.get("standing") is not None and event.metadata["lastActionSuccess"]:
             low, high = session.robot.pelvis_height_range_m
-            return self._to_height(high if call["standing"] else low)
+            event = self._to_height(high if call["standing"] else low)
+        if abs(wanted - seen) > 1.0:
+            event.metadata["errorMessage"] = f"horizon {wanted:g} has no effect: the head camera is fixed at {seen:.0f}"
         return event
 
     def _reachable(self, call: dict[str, Any]) -> Event:
@@ -470,7 +472,7 @@ class Controller:
     def _move_arm(self, call: dict[str, Any]) -> Event:
         """MoveArm(position, coordinateSpace): the hand to a point by inverse kinematics; world, armBase or wrist."""
         space = str(call.get("coordinateSpace", "armBase"))
-        arm = Arm(str(call.get("arm", Arm.RIGHT.value)).lower())
+        arm = _arm(call)
         body, point = self.session.body, from_thor(call.get("position", {}))
         hand, _ = body.arms.hand_pose(arm)
         origins = {"world": None, "armBase": body.posture.shoulder(arm), "wrist": hand}
@@ -574,6 +576,18 @@ class Controller:
 
 def _swapped(values: Mapping[str, float]) -> dict[str, float]:
     return {"x": values["x"], "y": values["z"], "z": values["y"]}
+
+
+def _arm(call: Mapping[str, Any]) -> Arm:
+    """The arm of a call, the right one by default.
+
+    Raises:
+        ValueError: when it is neither.
+    """
+    word = str(call.get("arm") or Arm.RIGHT.value).lower()
+    if word not in tuple(Arm):
+        raise ValueError(f"arm {call['arm']!r} is not left or right")
+    return Arm(word)
 
 
 def _arguments(action: Action) -> dict[str, Any]:

@@ -103,6 +103,19 @@ def test_crouch_and_stand(controller: Controller) -> None:
     assert controller.step("Stand").metadata["lastActionSuccess"]
 
 
+def test_a_horizon_is_told_of_and_done_ends_nothing(controller: Controller) -> None:
+    place = controller.last_event.metadata["agent"]
+    event = controller.step("TeleportFull", **place["position"], rotation=place["rotation"], horizon=-30, standing=True)
+    assert event.metadata["lastActionSuccess"] and "horizon -30 has no effect" in event.metadata["errorMessage"]
+    assert controller.step("Done").metadata["lastActionSuccess"]
+    assert controller.step("RotateLeft", degrees=30).metadata["lastActionSuccess"]
+
+
+def test_an_object_that_is_not_there_is_a_failure(controller: Controller) -> None:
+    event = controller.step("PickupObject", objectId="Mug_99")
+    assert not event.metadata["lastActionSuccess"] and event.metadata["errorCode"] == "ObjectNotVisible"
+
+
 def test_a_hand_goes_to_a_point(controller: Controller) -> None:
     hand, _ = controller.session.body.arms.hand_pose(Arm.RIGHT)
     there = to_thor(hand + (0.0, 0.0, 0.06))
@@ -148,6 +161,7 @@ def test_what_makes_no_sense_is_refused_with_a_reason(controller: Controller, na
         ("Teleport", {"position": {"x": 0, "y": 0, "z": float("nan")}}, "must be a finite number"),
         ("Teleport", {"rotation": {"x": 20, "y": 0, "z": 0}}, "must be about y only"),
         ("GetReachablePositions", {"gridSize": 0}, "gridSize 0 outside"),
+        ("PickupObject", {"objectId": "Mug_1", "arm": "third"}, "arm 'third' is not left or right"),
         ("MoveArm", {"position": {"x": 0, "y": 0, "z": 0}, "coordinateSpace": "elbow"}, "allowed: world, armBase, wrist"),
         ("AddThirdPartyCamera", {"fieldOfView": 400}, "fieldOfView 400 outside"),
     ],
