@@ -123,7 +123,7 @@ def _bar_axis(body: Body, obj: ObjectInstance) -> Array:
 
 
 def _to_bar(body: Body, arm: Arm, hand_target: HandPose, bar: Sequence[int]) -> Reach | None:
-    """How the open hand comes to a bar, straight ahead of its fingers."""
+    """Approach of the open hand to a bar, along its fingers."""
     assert hand_target.pointing is not None
     return plan_reach(body, arm, hand_target, -hand_target.pointing, 0.08, bar, pointing=0.7, closing=0.7)
 
@@ -193,7 +193,7 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
 
 
 def plan_handle(body: Body, arm: Arm, obj: ObjectInstance) -> Reach:
-    """How the open hand comes to the handle of a door or drawer.
+    """Approach of the open hand to the handle of a door or drawer.
 
     Raises:
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
@@ -250,7 +250,7 @@ def _plan_pull(body: Body, arm: Arm, part: MovingPart, reach: Reach, hand: Array
 
 
 def open_close(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
-    """Open and Close: leads a door or drawer by its handle; a handle that slipped on the way is taken once more.
+    """Open and Close: moves a door or drawer by its handle; a handle that slips is grasped once more.
 
     Raises:
         SkillFailure: what `assess_open_close` refuses, GraspMissed, HandleSlipped, or a contingency.
@@ -284,7 +284,7 @@ def _share(body: Body, part: MovingPart) -> float:
 
 
 def _pull(body: Body, action: Action, pull: Pull, outcome: str) -> Skill:
-    """Takes the handle, leads it, lets go and goes home; a door that would fall shut is kept in the hand.
+    """Grasps the handle, moves the door, releases and retracts; a self-closing door stays in the hand.
 
     Raises:
         SkillFailure: GraspMissed, or a contingency.
@@ -385,7 +385,7 @@ def assess_toggle(body: Body, action: Action) -> Reach:
 
 
 def plan_press(body: Body, arm: Arm, point: Array, ignore: tuple[str, ...]) -> Reach:
-    """How a fingertip of the empty hand comes to a point (3,) in the world.
+    """Approach of a fingertip of the empty hand to a point (3,) in the world.
 
     Raises:
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.

@@ -1,4 +1,4 @@
-"""Grasp constraints: what makes an object follow the hand once contact has justified it.
+"""Grasp constraints: they make an object follow the hand once contact justifies it.
 
 Every arm has one weld (objects) and one ball joint (handles of doors and drawers). They are pointed at a body at run time by
 writing `eq_obj2id` and `eq_data`, which MuJoCo reads at every step. A held body no longer touches the hands (a door: the hand
@@ -129,14 +129,14 @@ class GraspConstraints:
             self._set_bits(below, HELD_BITS)
 
     def detach(self, arm: str, bodies: Sequence[int], *, last: bool) -> None:
-        """Lets go of a body and what is hinged to it; `last` tells that no other hand still holds it."""
+        """Releases a body and the lids hinged to it; `last` means that no other hand still holds it."""
         for kind in ("weld", "ball"):
             self.data.eq_active[self._eq(arm, kind)] = 0
         if last:
             self.released += [(arm, body) for body in bodies]
 
     def settle_released(self, movable: dict[int, bool]) -> None:
-        """Gives released bodies their contact with the hands back once they are clear of both hands."""
+        """Restores contacts between released bodies and the hands once they are clear of both."""
         waiting: list[tuple[str, int]] = []
         for arm, body in self.released:
             if self._clear(body):

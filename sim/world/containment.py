@@ -1,4 +1,4 @@
-"""What stands on or in what, what it weighs with its contents, and where there is room for more."""
+"""Containment: what is on or in what, total masses, and free space on surfaces."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class Doors:
         self._scene = scene
 
     def update(self) -> None:
-        """Reads from the joints how far everything stands open."""
+        """Updates every object's openness from its joints."""
         qpos = self._scene.data.qpos
         for item in self._scene.objects.values():
             if item.moving:
@@ -39,7 +39,7 @@ class Doors:
                 )
 
     def put(self, item: ObjectInstance, openness: float) -> None:
-        """Puts all doors of an object at a share of their range at once, for the start of a scene.
+        """Sets all doors of an object to a share of their range at once, for the start of a scene.
 
         Raises:
             WorldError: when it has none.
@@ -51,7 +51,7 @@ class Doors:
         item.openness = openness
 
     def set_self_closing(self, item: ObjectInstance, value: bool) -> None:
-        """Puts springs on an object's doors or drawers that shut them, slowed by dampers, or takes the springs away.
+        """Adds closing springs with dampers to an object's doors or drawers, or removes them.
 
         Raises:
             WorldError: when it has no door or drawer.

@@ -1,4 +1,4 @@
-"""What the hands hold: objects tied to them, and doors, drawers and lids that they lead."""
+"""What the hands hold: objects, and doors, drawers and lids by their handles."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Grasps:
         item.held_by.append(arm)
 
     def give_way(self, object_id: str, part: MovingPart) -> None:
-        """Lets the hands into a lid that one of them is about to take, and into a free object below it.
+        """Disables contacts of the hands with a lid that one of them is about to grasp, and with a free object below it.
 
         Fingers around a tab would else press on the object, or hook into its rim and lift it.
         """
@@ -96,7 +96,7 @@ class Grasps:
         return name
 
     def settle(self) -> None:
-        """Gives what was let go of its contacts with the hands back, once it is clear of them."""
+        """Restores the contacts between the hands and released objects once they are clear of each other."""
         if self.constraints.released:
             self.constraints.settle_released(self._movable_body)
 

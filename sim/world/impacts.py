@@ -30,7 +30,7 @@ class Impacts:
         self.speeds_m_s: dict[str, float] = {}
 
     def step(self) -> None:
-        """Breaks what lost its speed since the last frame."""
+        """Breaks objects that were stopped abruptly since the last frame."""
         before = self.speeds_m_s
         for name, item in self._scene.objects.items():
             if not item.movable or not item.type.has("breakable") or item.state.isBroken or item.held_by:

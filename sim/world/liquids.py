@@ -86,7 +86,7 @@ class LiquidLedger:
         self.puddles = list(saved[3])
 
     def balance_l(self) -> float:
-        """Litres that are unaccounted for: 0 up to rounding, whatever has happened."""
+        """Litres unaccounted for: always 0 up to rounding."""
         held = sum(item.state.fillLitres for item in self._scene.objects.values())
         return self.given - self.drained - self.wiped - held - sum(puddle.litres for puddle in self.puddles)
 
@@ -199,7 +199,7 @@ class LiquidLedger:
         return None
 
     def run_out(self, seconds: float) -> None:
-        """What leaves tilted vessels in a while: into the vessel whose opening is below the rim, or onto what is below."""
+        """Flow out of tilted vessels over some time: into the vessel below the rim, or onto the surface there."""
         for item in self._scene.objects.values():
             if item.movable and item.state.fillLitres > 0.0 and float(self._scene.data.xmat[item.body_id, 8]) < STEEP:
                 self.pour(item, self.opening_below(self.rim(item), item), POUR_L_S * seconds)
@@ -236,7 +236,7 @@ class LiquidLedger:
         return None if best is None else best[1]
 
     def flow(self, seconds: float) -> None:
-        """What taps and coffee machines deliver in a while."""
+        """Flow from taps and coffee machines over some time."""
         for source in self._scene.objects.values():
             if not source.state.isToggled:
                 continue

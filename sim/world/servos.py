@@ -1,4 +1,4 @@
-"""The robot's joints: where they are, what their servos are told, and where its hands are.
+"""The robot's joints: positions, servo commands and hand poses.
 
 Base joints are x, y, pelvis height and yaw (m, rad), and the trunk's forward pitch, which follows from the height.
 """
@@ -45,7 +45,7 @@ class Servos:
         return np.array([self._scene.data.ctrl[self._actuator[name]] for name in BASE_JOINTS[:4]])
 
     def set_base_target(self, *, x: float | None = None, y: float | None = None, yaw: float | None = None) -> None:
-        """Commands the base; what is None keeps its target. Yaw is not wrapped: the servo turns the way the numbers go."""
+        """Commands the base; None keeps a target. Yaw is not wrapped: the servo follows the number as given."""
         for name, value in (("base_x", x), ("base_y", y), ("base_yaw", yaw)):
             if value is not None:
                 self._scene.data.ctrl[self._actuator[name]] = value
@@ -110,7 +110,7 @@ class Servos:
         return float(np.hypot(*gap))
 
     def jump(self, names: tuple[str, ...], at_rest: bool) -> None:
-        """Puts joints where their servos want them, at once."""
+        """Sets joint positions to their commands at once."""
         model, data = self._scene.model, self._scene.data
         for name in names:
             joint = model.joint(name)

@@ -38,7 +38,7 @@ class Thermal:
         self._scene, self._containment, self._states = scene, containment, states
 
     def settle(self) -> None:
-        """What starts in a cold source is cold."""
+        """Cools whatever starts inside a cold source."""
         for item in self._scene.objects.values():
             if item.type.has("cold_source"):
                 for name in self._containment.contents(item.object_id):

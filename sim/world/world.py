@@ -166,7 +166,7 @@ class World:
         mujoco.mj_forward(self.model, self.data)
 
     def _follow_couplings(self) -> None:
-        """Puts coupled finger joints where their leaders want them."""
+        """Sets coupled finger joints from their leading joints."""
         model, data = self.model, self.data
         for eq in range(model.neq):
             if int(model.eq_type[eq]) != int(mujoco.mjtEq.mjEQ_JOINT) or model.eq_obj2id[eq] < 0:
@@ -315,7 +315,7 @@ class World:
     # ---- snapshots ----------------------------------------------------------------------------------------------------------
 
     def save(self) -> WorldSnapshot:
-        """Everything the future depends on."""
+        """A snapshot of everything that the future depends on."""
         physics, arrays = read_physics(self.model, self.data)
         counters = {
             "steps": self._steps,

@@ -1,4 +1,4 @@
-"""Arms and waist: what their servos are told, and motions that keep to speed and acceleration."""
+"""Arms and waist: joint commands, and motions with bounded velocity and acceleration."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Arms:
         return self._data.site_xpos[site].copy(), self._data.site_xmat[site].reshape(3, 3).copy()
 
     def move(self, arm: Arm, waypoints: Sequence[Array], speed: float = 1.0) -> Skill:
-        """Moves the arm from its commanded posture straight to one (A,) waypoint after the other; `speed` scales the bounds."""
+        """Moves the arm in joint space from its commanded posture through (A,) waypoints; `speed` scales the bounds."""
         ids = self._joints.arms[arm]
         for goal in waypoints:
             ends = np.stack([self._data.ctrl[ids].copy(), goal])
@@ -63,7 +63,7 @@ class Arms:
             yield from self._follow(way, ids)
 
     def touch(self, arm: Arm, goal: Array, geoms: NDArray[np.int64], speed: float = 1.0) -> Skill:
-        """Moves the arm straight to (A,) joints, and stops where the hand touches one of some geoms."""
+        """Moves the arm to (A,) joints in joint space; stops when the hand touches one of the given geoms."""
         ids = self._joints.arms[arm]
         ends = np.stack([self._data.ctrl[ids].copy(), goal])
         way = plan(ends, ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed * speed)
@@ -72,7 +72,7 @@ class Arms:
     def _follow(
         self, way: Trajectory, ids: NDArray[np.int64], lead: bool = True, stop: Callable[[], bool] = lambda: False
     ) -> Skill:
-        """Sends servos along a trajectory.
+        """Tracks a trajectory with the servos.
 
         Args:
             way: of the joints.
@@ -91,7 +91,7 @@ class Arms:
             yield
 
     def move_both(self, goals: Sequence[BothGoal], speed: float = 1.0) -> Skill:
-        """Moves both arms and the waist together straight to one goal after the other."""
+        """Moves both arms and the waist together in joint space through a sequence of goals."""
         ids = np.concatenate([self._joints.arms[Arm.LEFT], self._joints.arms[Arm.RIGHT], self._joints.waist])
         for goal in goals:
             row = np.concatenate([goal.arms[Arm.LEFT], goal.arms[Arm.RIGHT], goal.waist])

@@ -1,4 +1,4 @@
-"""The robot's base and legs: where they are, and what their servos are told."""
+"""The robot's base and legs: measured state and commands."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Base:
         return Stance(float(x), float(y), float(yaw))
 
     def error_m(self) -> float:
-        """Distance between commanded and actual base, the heading weighed with 0.3 m per radian."""
+        """Tracking error of the base in metres; heading counts 0.3 m per radian."""
         x, y, z, yaw = self._data.ctrl[self._joints.base[:4]] - self._servos.base_pose[:4]
         return float(np.sqrt(x * x + y * y + z * z + (0.3 * yaw) ** 2))
 
@@ -49,7 +49,7 @@ class Base:
         self._data.ctrl[self._joints.legs] = joints
 
     def walking_targets(self, way: Array) -> tuple[Array, Array]:
-        """Servo targets that take base and feet along a way (T, 3) of x, y and yaw, ahead by what the servos lag behind.
+        """Servo targets for base and legs along a path (T, 3) of x, y and yaw, with compensation of the servo lag.
 
         Returns:
             (T, 3) base targets and (T, L) leg joints; the last ones are at rest.
@@ -63,7 +63,7 @@ class Base:
 
 
 def _ahead(targets: Array, lag_s: Array) -> Array:
-    """Targets (T, N) of a motion that ends at rest, moved ahead by the servos' lags (N,)."""
+    """Targets (T, N) of a motion that ends at rest, advanced by the servo lags (N,)."""
     if len(targets) < 2:
         return targets
     rates = np.gradient(targets, CONTROL_DT_S, axis=0)

@@ -1,4 +1,4 @@
-"""The robot as skills see it, made of parts that own one thing each.
+"""The robot as skills see it: a composition of parts, each the owner of one kind of fact.
 
 Skills own disjoint sets of joints: an arm skill its arm and hand, a body skill base and legs, a two-arm skill both arms and the
 waist. What is commanded is in the simulator's controls and what is held in the objects, so a world snapshot is a snapshot of
@@ -80,7 +80,7 @@ class Body:
     def assuming(
         self, stance: Stance | None = None, pelvis_height_m: float | None = None, diagnose: bool | None = None
     ) -> Body:
-        """This body under a hypothesis: what it answers holds for another stance or height, and nothing moves.
+        """This body under a hypothesis: queries are answered for another stance or pelvis height; nothing moves.
 
         Args:
             stance: assumed stance; None keeps what is assumed or commanded already.
@@ -110,7 +110,7 @@ class Body:
         return *numbers, objs, self.hypothesis
 
     def fits(self, stance: Stance) -> bool:
-        """Whether arms and hands, as they are commanded, would touch nothing at a stance."""
+        """Whether arms and hands in their commanded posture would be collision-free at a stance."""
         there = self.assuming(stance=stance)
         return all(there.probe.free(arm, [self.arms.commanded(arm)]) for arm in Arm)
 

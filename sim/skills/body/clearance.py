@@ -1,4 +1,4 @@
-"""What an arm posture would touch, asked on a copy of the simulator's state: nothing moves in the world.
+"""Collision queries for arm postures, evaluated on a copy of the simulator's state: nothing moves in the world.
 
 The hand's distance to an object is measured in the world itself, because the grasp depends on it.
 """
@@ -42,7 +42,7 @@ class _Cargo:
     geoms: frozenset[int]
 
     def follow(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Puts the object of a copy of the state where the hand has it."""
+        """Moves the held object in a copy of the state to where the hand carries it."""
         rotation = data.site_xmat[self.site].reshape(3, 3)
         data.qpos[self.qpos_adr : self.qpos_adr + 3] = data.site_xpos[self.site] + rotation @ self.offset
         quaternion = np.empty(4)
@@ -69,7 +69,7 @@ class AtDoor:
 
 
 class ClearanceProbe:
-    """Collision questions about arm postures."""
+    """Collision queries for arm postures."""
 
     def __init__(self, world: World, joints: JointMap, kit: RobotKit, posture: Posture) -> None:
         self._world, self._joints, self._kit, self._posture = world, joints, kit, posture
@@ -168,7 +168,7 @@ class ClearanceProbe:
         return np.array(depths)
 
     def _copy_state(self) -> None:
-        """The world's state, with the stance and the pelvis height that are assumed."""
+        """Copies the world's state and applies the assumed stance and pelvis height."""
         qpos, assumed = self._scratch.qpos, self._posture.hypothesis
         qpos[:] = self._world.data.qpos
         height, stance = assumed.pelvis_height_m, assumed.stance
@@ -178,7 +178,7 @@ class ClearanceProbe:
             qpos[self._base_adr] = stance.x, stance.y, stance.yaw_rad
 
     def against_door(self, arm: Arm, posture: Array, part: MovingPart, position: float, fist: bool = True) -> AtDoor:
-        """How an arm, with its fist closed or as it is, stands to a door or drawer at some joint position."""
+        """Clearance of an arm, with its fist closed or as it is, to a door or drawer at a given joint position."""
         world, scratch, model = self._world, self._scratch, self._world.model
         self._copy_state()
         base = self._posture.stance()
@@ -207,7 +207,7 @@ class ClearanceProbe:
         return AtDoor(gap, depth, bones, scratch.geom_xpos[self._hands[arm]].copy())
 
     def _cargo(self, arm: Arm) -> _Cargo | None:
-        """What the arm alone holds, as it lies in the hand now."""
+        """The object that this arm alone holds, with its present pose in the hand."""
         world = self._world
         name = world.grasps.held(arm.value)
         obj = None if name is None else world.objects[name]
@@ -220,11 +220,11 @@ class ClearanceProbe:
         return _Cargo(site, obj.qpos_adr, offset, turn, frozenset(map(int, obj.geom_ids)))
 
     def free(self, arm: Arm, postures: Iterable[Array], ignore: Iterable[str | int] = (), opening: float | None = None) -> bool:
-        """Whether some arm postures at most touch what is around."""
+        """Whether arm postures are free of collisions; light contact is tolerated."""
         return bool(np.all(self.depths_m(arm, postures, ignore, opening, limit_m=TOUCH_M) <= TOUCH_M))
 
     def load_depths_m(self, obj: ObjectInstance, poses: Iterable[Array]) -> Array:
-        """How deep a held object is in what is around at each of its poses (4, 4), world frame.
+        """Penetration of an object into its surroundings for each of its poses (4, 4), world frame.
 
         The robot and what lies in the object do not count.
         """

@@ -1,4 +1,4 @@
-"""Contacts as physics has them now: what the robot runs into, and what objects rest on."""
+"""Present contacts: what the robot collides with and what objects rest on."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Contacts:
         self._mine = np.where(np.isin(model.geom_bodyid, list(world.scene.robot_bodies)), 1, -1)
 
     def pushed(self) -> Array:
-        """(3,) how much the robot is pushed by what it runs into.
+        """(3,) how strongly obstacles push the robot.
 
         How deep it presses (m), how far the hands' joints are bent beyond their limits (rad, and m / 0.2 of sliding ones), and
         how far an arm's joint is from its target (rad), which is what yields first; 0 for the last one while nothing touches.

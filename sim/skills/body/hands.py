@@ -1,4 +1,4 @@
-"""Hands: how far they are told to open, and what they hold."""
+"""Hands: commanded opening and held objects."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Hands:
         return next((name for name, obj in self._world.objects.items() if len(obj.held_by) == 2), None)
 
     def at_furniture(self, arm: Arm | None = None) -> bool:
-        """Whether a hand, any or the given one, is at a door or drawer, which a body on the move would tear at."""
+        """Whether a hand, any or the given one, holds a door or drawer, so that the base must not move."""
         held = self.held.values() if arm is None else (self.held[arm],)
         return any(name is not None and not self._world.objects[name].movable for name in held)
 

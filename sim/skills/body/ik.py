@@ -102,7 +102,7 @@ class InverseKinematics:
         pointing_weight: float = 0.1,
         roll_weight: float = 0.1,
     ) -> ArmGoal:
-        """Solves one arm for a hand pose given in the world, waist straight, the other arm where it is told to be.
+        """Solves one arm for a hand pose in the world frame, with the waist straight and the other arm as commanded.
 
         An arm that is wound up or inside the robot's own body counts as far from its target.
 

@@ -20,7 +20,7 @@ class ObjectGeometry:
         self._world = world
 
     def interaction_point(self, object_id: str) -> Array:
-        """(3,) world point that a robot who goes to an object wants before it: handle, inside, switch or centre."""
+        """(3,) world point that a robot faces when it approaches an object: handle, interior, switch or centre."""
         obj = self._world.objects[object_id]
         if obj.movable and obj.type.lidded:  # to lift it as well as to open it
             return self._world.poses.center(object_id)
@@ -35,7 +35,7 @@ class ObjectGeometry:
         return self._world.poses.center(object_id)
 
     def faces_rad(self, object_id: str) -> tuple[float, ...]:
-        """World directions out of an object in which a robot stands well: square to what carries it, or to its own sides."""
+        """Preferred approach directions (world yaw) of an object: square to its support, or to its own sides."""
         obj = self._world.objects[object_id]
         square = obj
         if obj.movable and not self._world.containment.needs_two_hands(object_id):

@@ -39,7 +39,7 @@ class Posture:
         return Posture(self._data, self._joints, self._kit, hypothesis)
 
     def stance(self) -> Stance:
-        """Where the base is told to be, or is assumed to be."""
+        """Commanded or assumed base pose."""
         if self.hypothesis.stance is not None:
             return self.hypothesis.stance
         x, y, _, yaw = self._data.ctrl[self._joints.base[:4]]

@@ -27,7 +27,7 @@ _READY_DROP, _LOW_READY_DROP, _LOW_CARRY_DROP = 0.17, -0.04, -0.16
 
 @cache
 def ready_posture(kit: RobotKit, arm: Arm, raised: bool = False) -> Array:
-    """(A,) posture between actions: hand before the shoulder, fingers level, above tables and beside the camera's view.
+    """(A,) rest posture: hand in front of the shoulder, fingers level, above table height and outside the camera's view.
 
     Args:
         kit: the robot.
