@@ -130,7 +130,7 @@ def _to_bar(body: Body, arm: Arm, hand_target: HandPose, bar: Sequence[int]) -> 
 
 @cached_plan
 def assess_open_close(body: Body, action: Action) -> Pull | Push:
-    """What Open or Close would do.
+    """Plans Open or Close from the present state, without moving.
 
     Raises:
         SkillFailure: as the skill would before it moves.
@@ -373,7 +373,7 @@ def _leave(body: Body, arm: Arm, reach: Reach, ignore: tuple[str, ...]) -> Skill
 
 @cached_plan
 def assess_toggle(body: Body, action: Action) -> Reach:
-    """What ToggleOn or ToggleOff would do.
+    """Plans ToggleOn or ToggleOff from the present state, without moving.
 
     Raises:
         SkillFailure: as the skill would before it moves.

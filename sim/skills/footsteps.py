@@ -1,4 +1,4 @@
-"""Legs for feet that are away from their place under the pelvis: what a walking leg motion is made of.
+"""Leg joints for feet displaced from their neutral place under the pelvis: the table behind the walking motion.
 
 For a grid of pelvis heights, fore-and-aft, sideways and upward displacements of the soles the legs are solved once per robot
 and kept in the user's cache; in between they are interpolated. Feet stay level as far as the ankles allow. The paper's robots
@@ -61,7 +61,7 @@ class Footsteps:
         self._legs = RegularGridInterpolator(axes, arrays["legs"])
 
     def longest_m(self, pelvis_height_m: float) -> float:
-        """Longest step that the legs reach, both soles near the floor."""
+        """Longest step within the legs' reach with both soles on the floor."""
         return 2.0 * float(np.interp(pelvis_height_m, self._heights_m, self._reach_m))
 
     def joints(self, pelvis_height_m: float, feet: Array) -> Array:
@@ -92,7 +92,7 @@ def _left_joints(kit: RobotKit) -> NDArray[np.bool_]:
 
 @lru_cache(maxsize=4)
 def footsteps(kit: RobotKit) -> Footsteps:
-    """The footsteps of a robot; kept in the user's cache by all they depend on."""
+    """The footstep table of a robot, cached on disk by everything it depends on."""
     spec = kit.spec
     described = repr(dataclasses.replace(spec, mjcf_path=Path()))
     grid = f"{_AHEAD}|{_ASIDE}|{_UP}|{_GRID}|{_HEIGHTS}|{_TURN_RAD}|{_LEVEL}|{_VERSION}"
@@ -140,7 +140,7 @@ def _solved(kit: RobotKit) -> dict[str, Array]:
 
 
 def _reach_m(kit: RobotKit, height_m: float, ahead_m: Array, legs: Array) -> float:
-    """How far ahead and back the soles come, from leg joints (X, L) over displacements (X,), missing by little."""
+    """Reach of the soles ahead and back within tolerance, from leg joints (X, L) over displacements (X,)."""
     robot = kit.model
     root = np.array([0.0, 0.0, height_m, *root_quaternion(0.0, kit.crouches.pitch(height_m))])
     base, index = kit.crouches.posture(height_m), robot.indices(kit.spec.leg_joints)

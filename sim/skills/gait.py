@@ -1,4 +1,4 @@
-"""Where the feet go while the base travels: alternating steps, planned for a whole way at once.
+"""Footstep planning: alternating steps along a path of the base, planned for the whole path at once.
 
 The base leads and the feet follow. The way is cut into steps of equal progress, the first and the last half as long; a foot
 stands still on the floor for one step and swings for the next, to the place under the hips where the base will be in the middle
@@ -28,7 +28,7 @@ _LIFT: Final = 0.045
 
 
 def leg_motion(feet: Footsteps, pelvis_height_m: float, soles_m: Array, way: Array) -> Array:
-    """(T, L) leg joints that walk along a way of the base.
+    """(T, L) leg joints that walk along a path of the base.
 
     Args:
         feet: the robot's footsteps.

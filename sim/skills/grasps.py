@@ -79,7 +79,7 @@ def _directions(center: Array, shoulder: Array, elevations_deg: tuple[float, ...
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """The solid box of an object as it lies: centre, axes, half extents, and the point that a hand prefers."""
+    """Solid bounding box of an object in its present pose: centre, axes, half extents, and preferred grip point."""
 
     center: Array
     rotation: Array
@@ -112,7 +112,7 @@ def solid_box(obj: ObjectInstance) -> tuple[Array, Array]:
 
 
 def grasp_candidates(body: Body, arm: Arm, obj: ObjectInstance) -> Iterator[Grasp]:
-    """Grasps of an object, most promising first; whether the arm can do them is for the caller to find out."""
+    """Grasp candidates of an object, most promising first; the caller checks reachability."""
     hand = body.spec.hand
     shape = _shape(body, obj)
     shoulder = body.posture.shoulder(arm)

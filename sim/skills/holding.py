@@ -1,4 +1,4 @@
-"""Hold and Release: a hand takes hold of something where it is, and lets go of what it holds.
+"""Hold and Release: a hand grasps something in place, and releases what it holds.
 
 Hold is Pick without the lift: the object stays where it is and so does the hand, to steady it for the other one; a door or
 drawer is held by its handle. While furniture is held the robot does not walk. Release opens the hand wherever it is; what it
@@ -25,7 +25,7 @@ __all__ = ["assess_hold", "hold", "release"]
 
 @cached_plan
 def assess_hold(body: Body, action: Action) -> tuple[Grasp | None, Reach]:
-    """What Hold would do; no grasp for a handle.
+    """Plans Hold from the present state, without moving; no grasp for a handle.
 
     Raises:
         SkillFailure: as the skill would before it moves.

@@ -1,4 +1,4 @@
-"""How a hand leads the tab or knob of a lid: the fingertips follow its arc, so that they stay where the handle is.
+"""Opening and closing lids by a tab or knob: the fingertips follow the arc of the handle.
 
 A door's bar lies deep in the hand, and the hand turns with it. A lid's tab is small and is held by the fingertips; the lid
 turns about a level axis by more than a right angle, which no wrist follows. So the hand keeps its direction as well as it can,
@@ -54,7 +54,7 @@ class _Tab:
 
 @dataclass(frozen=True, slots=True)
 class Lead:
-    """A hand's way to a tab and with it.
+    """Motion of a hand to a tab and along its arc.
 
     Attributes:
         reach: the motion to the tab.
@@ -133,7 +133,7 @@ def _takings(body: Body, arm: Arm, tab: Array, pointings: Iterable[Array], bar: 
 
 
 def plan_tab(body: Body, arm: Arm, tab: Array, pointings: Iterable[Array], bar: Sequence[int]) -> Reach | None:
-    """How the fingertips come to a tab (3,) in the world, None when they do not; `bar` are geoms that may be touched there."""
+    """Approach of the fingertips to a tab (3,) in the world, None when out of reach; `bar` are geoms that may be touched."""
     return next((taking.reach for taking in _takings(body, arm, tab, pointings, bar)), None)
 
 
@@ -146,7 +146,7 @@ def plan_lead(
     bar: Sequence[int],
     enough: int,
 ) -> Lead | None:
-    """How the fingertips take a tab and lead it along its arc, as far as the arm gets.
+    """Plan to grasp a tab and move it along its arc as far as the arm reaches.
 
     Args:
         body: the robot.

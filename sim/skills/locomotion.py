@@ -69,7 +69,7 @@ def _turn_by(body: Body, change_rad: float) -> Skill:
 
 
 def _walk(body: Body, path: NDArray[np.float64], along: bool, limits: NDArray[np.float64] = _PUSHED) -> Skill:
-    """Follows a polyline; `along` turns the heading into the way as it goes, at a bounded rate."""
+    """Follows a polyline; `along` turns the heading into the direction of travel at a bounded rate."""
     way = plan_polyline(path, WALK_SPEED_M_S, WALK_ACCELERATION_M_S2)
     yaw = body.posture.stance().yaw_rad
     poses = []
@@ -93,7 +93,7 @@ def _ticks(duration_s: float) -> list[float]:
 
 
 def _travel(body: Body, way: NDArray[np.float64], limits: NDArray[np.float64] = _PUSHED) -> Skill:
-    """Takes the base along a way (T, 3) of x, y and yaw, with walking legs; a hand that runs into something ends it.
+    """Moves the base along a path (T, 3) of x, y and yaw with walking legs; stops when a hand hits something.
 
     What presses at the start may go on pressing a little, so that the robot can walk away from it.
 
@@ -178,7 +178,7 @@ def step_to(body: Body, path: NDArray[np.float64], yaw_rad: float) -> Skill:
 
 
 def sweep(body: Body, arm: Arm, postures: NDArray[np.float64], stances: NDArray[np.float64], duration_s: float) -> Skill:
-    """Leads a hand along a way that arm, base and legs make together, from rest to rest.
+    """Moves a hand along a path with arm, base and legs together, from rest to rest.
 
     Args:
         body: the robot.
@@ -206,7 +206,7 @@ def sweep(body: Body, arm: Arm, postures: NDArray[np.float64], stances: NDArray[
 
 
 def move(body: Body, action: Action) -> Skill:
-    """Straight steps ahead, back or sideways; walks as far as the way is free and fails when that is not all of it.
+    """Walks straight ahead, back or sideways as far as the path is free; fails when it is blocked before the end.
 
     Raises:
         SkillFailure: BlockedPath with the metres that were walked.
@@ -238,7 +238,7 @@ def rotate(body: Body, action: Action) -> Skill:
 
 
 def change_height(body: Body, action: Action) -> Skill:
-    """MoveUp and MoveDown: bends or stretches the legs, as far as they go and as long as the arms run into nothing.
+    """MoveUp and MoveDown: bends or stretches the legs within their range, until the arms hit something.
 
     Raises:
         SkillFailure: HeightLimit, with the part of the change that was not made, when they could do less than asked.

@@ -114,7 +114,7 @@ def _find_grasp(
 
 
 def stow(body: Body, arm: Arm, ignore: tuple[str | int, ...] = ()) -> Skill:
-    """Brings the arm to its ready posture, or to the carrying one with something in the hand, around what is in the way."""
+    """Moves the arm to its ready posture, or to the carrying posture when loaded, around obstacles."""
     held = body.hands.held[arm]
     goal = ready_posture(body.kit, arm) if held is None or not body.obj(held).movable else _carry(body, arm, held)
     if held is not None and body.obj(held).state.fillLitres > 0.0:
@@ -167,7 +167,7 @@ _NUDGE_RAD: Final = 0.6
 
 
 def shift_hand(body: Body, arm: Arm, change: Array) -> Skill:
-    """Moves the hand by a small way in the world, as far as the arm can."""
+    """Shifts the hand by a small displacement in the world frame, if the arm can."""
     position, hand = body.arms.hand_pose(arm)
     goal = body.ik.solve(arm, HandPose(position + change, hand[:, 0], hand[:, 1]), start=body.arms.commanded(arm))
     if goal.error_m < 0.03 and float(np.max(np.abs(goal.q - body.arms.commanded(arm)))) < _NUDGE_RAD:
@@ -272,7 +272,7 @@ def _lift(body: Body, arm: Arm) -> Skill:
 
 
 def _bad_luck(body: Body, arm: Arm, obj: ObjectInstance, outcome: str) -> Skill:
-    """Acts out a contingency of Pick: the object leaves the hand, and may break or lose its liquid."""
+    """Executes a contingency of Pick: the object leaves the hand, and may break or spill."""
     codes = {"slipped": FailureCode.SLIPPED, "spilled": FailureCode.SPILLED, "broken": FailureCode.BROKE}
     code = codes.get(outcome, FailureCode.NOTHING_HAPPENED)
     body.world.grasps.detach(arm.value)
@@ -287,7 +287,7 @@ def _bad_luck(body: Body, arm: Arm, obj: ObjectInstance, outcome: str) -> Skill:
 
 
 def plan_place(body: Body, arm: Arm, obj: ObjectInstance, receptacle: ObjectInstance) -> tuple[Array, Reach, Array]:
-    """Where the held object goes and how the arm brings it there.
+    """Target spot of the held object and the arm motion to it.
 
     Returns:
         The spot (3,) on the surface, the motion, and the direction in which the hand leaves.
@@ -323,7 +323,7 @@ def plan_bring(
     coming_from: Array = _UP,
     from_m: float = _APPROACH_PLACE_M,
 ) -> tuple[Array, Reach, Array]:
-    """How the arm brings what it holds, upright, to one of some spots.
+    """Plan to bring a held object upright to one of several spots.
 
     Args:
         body: the robot.
@@ -417,7 +417,7 @@ def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
 
 @cached_plan
 def assess_pick(body: Body, action: Action) -> tuple[Grasp, Reach]:
-    """What Pick would do.
+    """Plans Pick from the present state, without moving.
 
     Raises:
         SkillFailure: as Pick would before it moves.
@@ -430,7 +430,7 @@ def assess_pick(body: Body, action: Action) -> tuple[Grasp, Reach]:
 
 @cached_plan
 def assess_place(body: Body, action: Action) -> tuple[Array, Reach, Array]:
-    """What Place would do.
+    """Plans Place from the present state, without moving.
 
     Raises:
         SkillFailure: as Place would before it moves.

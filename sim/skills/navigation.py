@@ -1,4 +1,4 @@
-"""Where the base can stand and how it gets there: an occupancy map, shortest paths, stances for GoTo.
+"""Navigation of the base: occupancy map, shortest paths, stances for GoTo.
 
 Obstacles are rectangles on the floor (furniture, walls, closed and opened doors, objects that lie on the floor). The robot is
 a disc, so a base position is free when its distance to every rectangle is at least the robot's radius. Paths are shortest on
@@ -153,7 +153,7 @@ class NavigationMap:
         return self.ways(start).to(goal)
 
     def ways(self, start: NDArray[np.float64]) -> Ways:
-        """All shortest ways from a start, by one search."""
+        """Shortest paths from a start to everywhere, by one search."""
         start = np.asarray(start, dtype=np.float64)
         source = self._nearest_free_cell(start)
         if source is None:
@@ -244,7 +244,7 @@ class NavigationMap:
 
 @dataclass(frozen=True, slots=True)
 class Ways:
-    """The shortest ways from one start to everywhere.
+    """Shortest paths from one start to all free cells.
 
     Attributes:
         map: the free space.

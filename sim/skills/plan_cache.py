@@ -1,4 +1,4 @@
-"""Plans made once: the expert asks what an action would do, and right afterwards the skill does it from the same state."""
+"""Plan cache: the expert plans an action, and right afterwards the skill executes it from the same state."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 def cached_plan(plan: Callable[[Body, Action], T]) -> Callable[[Body, Action], T]:
-    """Lets a planner of an action return its last plan again while nothing that it depends on has changed."""
+    """Caches the plan of an action as long as nothing that it depends on has changed."""
 
     @functools.wraps(plan)
     def wrapped(body: Body, action: Action) -> T:

@@ -56,7 +56,7 @@ def _opening(body: Body, obj: ObjectInstance) -> tuple[Array, float]:
 
 @cached_plan
 def assess_pour(body: Body, action: Action) -> tuple[Reach, float]:
-    """What Pour would do: the motion to beside the target, and the turn of the last joint.
+    """Plans Pour from the present state, without moving: the motion to beside the target, and the turn of the last joint.
 
     Raises:
         SkillFailure: as the skill would before it moves.
@@ -171,7 +171,7 @@ def _outlet(body: Body, object_id: str) -> ObjectInstance:
 
 @cached_plan
 def assess_fill(body: Body, action: Action) -> Reach:
-    """What Fill would do.
+    """Plans Fill from the present state, without moving.
 
     Raises:
         SkillFailure: as the skill would before it moves.

@@ -429,7 +429,7 @@ def _route(
 
 
 def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
-    """Steps to the stance, brings the fist to the face, pushes along the arc, draws the fist back and goes home.
+    """Walks to the stance, moves the fist to the door face, pushes along the arc, retracts and stows the arm.
 
     Where the step takes the door along, it ends there: the rest has to be planned again.
 
@@ -465,7 +465,7 @@ def push_shut(body: Body, action: Action, push: Push, outcome: str) -> Skill:
 
 
 def _draw_back(body: Body, arm: Arm, away: Array) -> Skill:
-    """Takes the fist off the face, straight out, and brings the arm home with an open hand."""
+    """Retracts the fist from the face and stows the arm with an open hand."""
     yield from body.arms.move(arm, list(away))
     yield from body.hands.move(arm, 1.0, 0.2)
     yield from stow(body, arm)

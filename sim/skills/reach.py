@@ -88,7 +88,7 @@ def diagnose(body: Body, points: Mapping[Arm, Array], plan: Callable[[Body], obj
 
 
 def diagnosed(body: Body, points: Mapping[Arm, Array], search: Callable[[Body], T]) -> T:
-    """What a search finds; one that fails is put down to distance, height or obstruction, see `diagnose`.
+    """Runs a search; a failure is attributed to distance, height or obstruction, see `diagnose`.
 
     Raises:
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
@@ -102,7 +102,7 @@ def diagnosed(body: Body, points: Mapping[Arm, Array], search: Callable[[Body], 
 def route(
     body: Body, arm: Arm, start: Array, goal: Array, ignore: Iterable[str | int] = (), opening: float | None = None
 ) -> tuple[Array, ...] | None:
-    """Postures to pass between two arm postures without a collision: none, or one with the hand drawn in or raised."""
+    """Collision-free via postures between two arm postures: none, or one with the hand drawn in or raised."""
     ignore = tuple(ignore)
     best: tuple[float, tuple[Array, ...]] | None = None
     for via in (None, *body.ik.vias(arm)):

@@ -1,4 +1,4 @@
-"""What each arm reaches: a table of sampled arm postures with the pose of the hand, and quick questions to it.
+"""Reachability map of each arm: a table of sampled arm postures with hand poses, and fast queries.
 
 Inverse kinematics with few degrees of freedom (H1: five per arm) has local minima and no room for an arbitrary hand
 orientation. The table answers both: for a point it gives the posture whose hand points best, as the start of the solver, and it
@@ -135,7 +135,7 @@ class ReachMap:
 
 @lru_cache(maxsize=4)
 def reach_maps(kit: RobotKit) -> dict[str, ReachMap]:
-    """The reach maps of a robot's `left` and `right` arm, waist straight; kept in the user's cache by all they depend on."""
+    """Reach maps of a robot's `left` and `right` arm, waist straight; cached on disk by everything they depend on."""
     spec = kit.spec
     described = repr(dataclasses.replace(spec, mjcf_path=Path()))
     key = hashlib.sha256(

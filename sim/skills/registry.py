@@ -1,4 +1,4 @@
-"""The skill behind every action, whether two of them may run together, and what an action would meet without doing it."""
+"""Skill registry: the skill behind every action, which of them exclude each other, and dry-run assessment."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _walks(body: Body, action: Action, known: frozenset[str]) -> bool:
 
 
 def assess_action(body: Body, action: Action, known: frozenset[str]) -> SkillFailure | None:
-    """Why an action would be refused from here, None when it would be tried; plans the arm's motion but moves nothing."""
+    """Dry run: why an action would be refused from here, None when it would be tried. Plans the motion, moves nothing."""
     if action.object_id is not None and action.object_id not in known:
         return SkillFailure(FailureCode.OBJECT_NOT_KNOWN)
     skill = SKILLS.get(action.name)

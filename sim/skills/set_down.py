@@ -1,4 +1,4 @@
-"""PlaceBoth: both hands bring what they hold over the edge of a receptacle and put it down.
+"""PlaceBoth: both hands carry their load over the edge of a receptacle and put it down.
 
 A load that is carried lower than the receptacle's top comes straight up first, then passes over the edge, then comes down. How
 high it passes, and past what, is asked of a copy of the simulator's state; where the arms do not raise it as far, another
@@ -71,7 +71,7 @@ class BothPlacement:
 
 @cached_plan
 def assess_place_both(body: Body, action: Action) -> BothPlacement:
-    """What PlaceBoth would do.
+    """Plans PlaceBoth from the present state, without moving.
 
     Raises:
         SkillFailure: as PlaceBoth would before it moves.

@@ -1,4 +1,4 @@
-"""Skills with a tool in the hand, or the hand as one: Slice, Clean, UseUp.
+"""Tool skills: Slice, Clean, and UseUp, where the hand is the tool.
 
 The tool is brought down on the object by the same checked motion that puts things down, must touch it (within 15 mm), and is
 drawn to and fro; only then the state changes. Every failure brings the arm back first. Paper: slicing, cleaning and using up
@@ -53,7 +53,7 @@ def _blade(tool: ObjectInstance) -> Array:
 
 @cached_plan
 def assess_slice(body: Body, action: Action) -> Reach:
-    """What Slice would do.
+    """Plans Slice from the present state, without moving.
 
     Raises:
         SkillFailure: as the skill would before it moves.
@@ -67,7 +67,7 @@ def assess_slice(body: Body, action: Action) -> Reach:
 
 @cached_plan
 def assess_clean(body: Body, action: Action) -> Reach:
-    """What Clean would do.
+    """Plans Clean from the present state, without moving.
 
     Raises:
         SkillFailure: as the skill would before it moves.
@@ -85,7 +85,7 @@ def assess_clean(body: Body, action: Action) -> Reach:
 
 @cached_plan
 def assess_use_up(body: Body, action: Action) -> Reach:
-    """What UseUp would do.
+    """Plans UseUp from the present state, without moving.
 
     Raises:
         SkillFailure: as the skill would before it moves.

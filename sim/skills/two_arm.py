@@ -94,7 +94,7 @@ def _goal(body: Body, sides: Mapping[Arm, tuple[Array, Array]], apart_m: float, 
 
 @cached_plan
 def assess_lift(body: Body, action: Action) -> BothReach:
-    """What Lift would do.
+    """Plans Lift from the present state, without moving.
 
     Raises:
         SkillFailure: as Lift would before it moves.
@@ -194,7 +194,7 @@ def hands_m(body: Body) -> float:
 
 
 def against_sag(body: Body, sag_m: float) -> BothGoal | None:
-    """The posture that makes up for how far the servos give way under a load, None where that is little or out of reach."""
+    """Posture that compensates the sag of the servos under a load, None where the sag is small or the posture out of reach."""
     if sag_m <= _SAG_M:
         return None
     higher = _shifted(body, 2.0 * min(sag_m, _MOST_SAG_M), 0.0)

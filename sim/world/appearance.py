@@ -1,4 +1,4 @@
-"""How states look: lit lamps and screens, levels of liquids, puddles, dirt, browning, breakage."""
+"""Visual appearance of states: lit lamps and screens, liquid levels, puddles, dirt, browning, breakage."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Appearance:
         self._geom_pos, self._geom_size = scene.model.geom_pos.copy(), scene.model.geom_size.copy()
 
     def update(self, item: ObjectInstance) -> None:
-        """Brings the look of an object in line with its state."""
+        """Updates the appearance of an object from its state."""
         model, state, colors = self._scene.model, item.state, self._scene.catalogue.colors
         for geom, part in self._scene.part_of_geom[item.object_id]:
             rgba = np.array(colors[part.color], dtype=float)
