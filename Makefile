@@ -10,8 +10,12 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export WANDB_MODE ?= offline
 # Model weights come from this repository or from a path you give, never from a hub.
 export HF_HUB_OFFLINE ?= 1
+XDIST := -n auto --maxprocesses=4 --dist=worksteal
+QUICK := tests/configs tests/data/interface tests/model tests/planners tests/report \
+  $(addprefix --ignore=tests/,$(addprefix report/test_,export.py figures.py notebook.py reconstruction.py tokenizer.py video.py) \
+  $(addprefix planners/,chat/dag_plan/test_episode.py scripted/test_planner.py test_released.py))
 
-.PHONY: setup eval test check serve motions lock third-party clean
+.PHONY: setup eval test test-slow quick check serve motions lock third-party clean
 
 setup: $(STAMP)
 
@@ -25,8 +29,16 @@ $(STAMP): requirements.lock pyproject.toml
 eval: $(STAMP)
 	$(BIN)/python eval.py planner=proprio robot=h1
 
+# The tests but those marked `slow`, on all cores up to four.
 test: $(STAMP)
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest $(XDIST) -m "not slow" $(PYTEST_ARGS)
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest $(XDIST) -m slow $(PYTEST_ARGS)
+
+# What needs no simulator, for the minute between two edits.
+quick: $(STAMP)
+	$(BIN)/python -m pytest $(XDIST) -m "not slow" $(QUICK) $(PYTEST_ARGS)
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .

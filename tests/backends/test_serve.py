@@ -55,6 +55,7 @@ def stop(process: subprocess.Popen[str], ending: signal.Signals) -> None:
     assert (process.returncode, out, err) == (0, "", "")
 
 
+@pytest.mark.slow
 def test_the_tiny_model_is_served(view: Callable[..., ChatImage]) -> None:
     with command() as process, command() as other:
         url, said = ready(process)

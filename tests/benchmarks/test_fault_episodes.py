@@ -98,6 +98,7 @@ def test_a_faulty_planner_is_a_privileged_planner_that_needs_a_session() -> None
         planner.reset(TaskInfo("x", "h1", 1), np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_known_mistakes_get_their_type() -> None:
     results = [
         result

@@ -104,6 +104,7 @@ def test_replay_configuration_is_checked(values: dict, message: str) -> None:
         ReplayConfig(**values)
 
 
+@pytest.mark.slow
 def test_ray_writes_what_one_process_writes(tmp_path: Path) -> None:
     serial = build_clips(CFG, tmp_path / "serial", picture)
     cfg = dataclasses.replace(CFG, workers=2, scheduler="ray")

@@ -26,14 +26,14 @@ def request_(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DaggerRequest:
         return PlanStep.parse(f"GoTo({observation.known_objects[-1]})")
 
     monkeypatch.setattr(dagger, "_student", lambda model: student)
-    monkeypatch.setattr(dagger, "_PER_PART", {"demos": 2, "text_planning": 2})
-    return DaggerRequest(tmp_path / "model", tmp_path / "dagger", "demos", 4, 0, 0.5, 56, "hash")
+    monkeypatch.setattr(dagger, "_PER_PART", {"demos": 1, "text_planning": 2})
+    return DaggerRequest(tmp_path / "model", tmp_path / "dagger", "demos", 2, 0, 0.9, 56, "hash")
 
 
 def test_an_interrupted_run_continues_to_the_same_rows(
     request_: DaggerRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = DaggerRequest(request_.model, tmp_path / "whole", "demos", 4, 0, 0.5, 56, "hash")
+    whole = DaggerRequest(request_.model, tmp_path / "whole", "demos", 2, 0, 0.9, 56, "hash")
     collect_dagger(whole, workers=1)
     part, calls = dagger._part, []
 
@@ -54,9 +54,9 @@ def test_an_interrupted_run_continues_to_the_same_rows(
     assert len(one) > 0
     assert one.column("target") == other.column("target")
     assert one.column("image") == other.column("image")
-    # which of the four episodes end in success, and so give rows, differs between processors
+    # which of the episodes end in success, and so give rows, differs between processors
     assert set(one.column("robot")) <= {"h1", "x1"}
-    assert one.manifest.metadata["expert_share"] == 0.5
+    assert one.manifest.metadata["expert_share"] == 0.9
 
 
 @pytest.fixture

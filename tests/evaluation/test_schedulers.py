@@ -93,6 +93,7 @@ def test_processes_write_the_serial_ledger(cfg: EvalConfig, serial: list[Episode
     assert len(serial) == 3
 
 
+@pytest.mark.slow
 def test_ray_with_one_model_for_all_writes_the_serial_ledger(cfg: EvalConfig, serial: list[EpisodeRecord], ray: Any) -> None:
     own = dataclasses.replace(cfg, scheduler="ray", workers=2, batch=2, output=f"{cfg.output}-ray")
     assert ledger(own) == serial
@@ -113,6 +114,7 @@ class Fragile:
         return 2 * job
 
 
+@pytest.mark.slow
 def test_killed_ray_workers_are_replaced_and_their_jobs_run_again(ray: Any, tmp_path: Path) -> None:
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
     done = run_ray_jobs(ray, functools.partial(Fragile, tmp_path), [1, 2, 4], 2, lambda r: r == 8, lambda job, why: why)
@@ -121,6 +123,7 @@ def test_killed_ray_workers_are_replaced_and_their_jobs_run_again(ray: Any, tmp_
     assert list(lost) == ["the worker died in 2 attempts"]
 
 
+@pytest.mark.slow
 def test_ray_keeps_to_itself(ray: Any) -> None:
     assert ray.util.get_node_ip_address() == "127.0.0.1"
     assert ray.cluster_resources()["CPU"] == 2
@@ -175,6 +178,7 @@ def test_a_models_process_answers_callers_apart_and_is_started_again(own: Planne
     assert not Path(model.server.path).exists()
 
 
+@pytest.mark.slow
 def test_a_models_actor_is_started_again(own: PlannerConfig, ray: Any) -> None:
     class Caller:
         def __init__(self, server: Any) -> None:

@@ -40,6 +40,7 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "memory"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planner", ["gpt4o", "llm_planner", "rap", "dag_plan"])
 def test_a_planner_asks_the_served_model_and_repeats_the_run_without_it(
     planner: str, url: str, memory: Path, tmp_path: Path

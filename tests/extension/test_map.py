@@ -51,6 +51,7 @@ def test_the_keys_that_the_map_names_exist() -> None:
                 found = found[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("addition", [SKILL, QUANTIZER, STAGE], ids=lambda addition: addition.name)
 def test_what_the_map_lists_is_enough(addition: Addition, tmp_path: Path) -> None:
     assert {edit.path for edit in addition.edits} == touched(addition.row, addition.name)
@@ -85,6 +86,7 @@ def assets(tmp_path: Path) -> Path:
     return tmp_path / "assets"
 
 
+@pytest.mark.slow
 def test_a_third_robot_needs_no_code(assets: Path, tmp_path: Path) -> None:
     assert touched("a robot", "stubby") >= {"robots/stubby.yaml", "robots/stubby.xml"}
     code = (
@@ -100,6 +102,7 @@ def test_a_third_robot_needs_no_code(assets: Path, tmp_path: Path) -> None:
     assert done.stdout.endswith("works\n"), done.stderr[-3000:]
 
 
+@pytest.mark.slow
 def test_a_planner_is_a_file(tmp_path: Path) -> None:
     planner = tmp_path / "mine.py"
     planner.write_text((ROOT / "examples" / "own_planner.py").read_text(encoding="utf-8"), encoding="utf-8")

@@ -27,7 +27,7 @@ def fingerprint(robot: str) -> str:
     return digest.hexdigest()
 
 
-@pytest.mark.parametrize("robot", ["h1", "x1"])
+@pytest.mark.parametrize("robot", ["h1", pytest.param("x1", marks=pytest.mark.slow)])
 def test_processes_agree(robot: str) -> None:
     code = f"import runpy; print(runpy.run_path({__file__!r})['fingerprint']({robot!r}))"
     found = {fingerprint(robot)}

@@ -147,6 +147,7 @@ def test_cameras_around_the_robot_see_it_and_the_head_sees_no_sky(room: str) -> 
         assert head is not None and head.max() < 12.0, "walls and ceiling close the room"
 
 
+@pytest.mark.slow
 def test_canvases_that_are_given_up_harm_no_other() -> None:
     world = World(None, "bathroom_1")
     view = world.cameras.render("overview", 40, 40, segmentation=True)
