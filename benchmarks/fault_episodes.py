@@ -22,7 +22,7 @@ from data.interface.actions import ACTIONS, ActionKind
 from data.interface.episode import EpisodeRecord, Outcome
 from data.interface.failures import FailureCategory
 from data.interface.steps import PlanStep
-from proprio_mllm.evaluation.episode import EpisodeKeyFields, RunnableSession, run_episode
+from proprio_mllm.evaluation.episode import EpisodeKeyFields, Limits, RunnableSession, run_episode
 from proprio_mllm.evaluation.seeds import episode_seed, stream
 from proprio_mllm.evaluation.sessions import open_session
 from sim.tasks.task import BENCHMARK_PATH, Task, load_benchmark
@@ -165,7 +165,7 @@ def run_scripted(episode: Scripted, task: Task) -> ScriptedResult:
         opened.append(open_session(RobotConfig(episode.robot), "easy", "fixed", task, own_seed, planner))
         return opened[-1]
 
-    record = run_episode(open_one, planner, fields, task.instruction, task.step_budget, own_seed)
+    record = run_episode(open_one, planner, fields, task.instruction, Limits.of(task.time_limit, "task"), own_seed)
     broken = record.outcome is Outcome.INFRASTRUCTURE_ERROR
     unmet = () if broken else tuple(sorted(opened[-1].goals().unmet_objects))
     return ScriptedResult(episode, record, planner.exercised, planner.slipped, unmet)

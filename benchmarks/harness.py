@@ -65,6 +65,9 @@ class Timed:
     def stats(self) -> Stats:
         return self._session.stats()
 
+    def stance(self) -> tuple[float, float, float, float]:
+        return self._session.stance()
+
     def relations(self) -> Mapping[str, Sequence[str]]:
         return self._session.relations()
 
@@ -156,7 +159,7 @@ def batches(weights: Path, tasks: Sequence[Task]) -> dict[str, float]:
     seen = []
     for task in tasks:
         session = open_session(RobotConfig("h1"), "easy", "fixed", task, 0, planner)
-        seen.append(dataclasses.replace(session.reset(0), step=0, step_budget=task.step_budget))
+        seen.append(dataclasses.replace(session.reset(0), step=0, time_limit=task.time_limit))
     states = [planner.begin(TaskInfo(one.instruction, "h1", 9), np.random.default_rng(0)) for one in seen]
     rates: dict[str, float] = {}
     for size in (1, 2, 4, 8):

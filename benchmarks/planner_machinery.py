@@ -80,7 +80,7 @@ def scheduling(robot: str, count: int, folder: Path, memory: str) -> list[str]:
     os.environ["MISTAKES"] = "0"
     tasks = [task for task in chosen(robot, 4 * count) if task.category != "single"][: 2 * count]
     file = folder / "scheduling.jsonl"
-    write_tasks([dataclasses.replace(task, step_budget=40) for task in tasks], file)
+    write_tasks([dataclasses.replace(task, time_limit=40) for task in tasks], file)
     records: list[dict[str, EpisodeRecord]] = []
     for parallel in ("true", "false"):
         changes = [f"robot={robot}", "reflection=off", f"planner.parallel={parallel}"]

@@ -46,7 +46,7 @@ __all__ = [
     "encode_png",
 ]
 
-SCHEMA_VERSION: Final = 1
+SCHEMA_VERSION: Final = 2
 _MANIFEST: Final = "manifest.json"
 
 

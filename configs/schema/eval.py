@@ -63,8 +63,8 @@ class PlannerConfig:
         train: command that makes the weights, for the message when they are absent.
         temperature: 0 takes the most likely token.
         max_new_tokens: longest reply.
-        image_size: side of the head view in pixels for `random`, `scripted` and `expert`; others bring their own, or have
-            `backend.image_size`.
+        image_size: side of the head view in pixels for `random`, `scripted` and `expert`, 0 for none; others bring their own,
+            or have `backend.image_size`.
         reflection: `on` reflects on failures. Planners of a backend ask once more for cause, change and new steps; a stored
             model reads its failed steps in the log, which `off` leaves out.
         replans: most re-plans, reflecting or not, of an episode.
@@ -101,7 +101,10 @@ class PlannerConfig:
         require((self.source is not None) == (self.kind == "file"), f"kind {self.kind!r} with source {self.source!r}")
         require(self.temperature >= 0.0, f"temperature {self.temperature} must not be negative")
         require(self.max_new_tokens > 0, f"max_new_tokens {self.max_new_tokens} must be positive")
-        require(16 <= self.image_size <= 2048, f"image_size {self.image_size} outside [16, 2048]")
+        require(
+            self.image_size == 0 or 16 <= self.image_size <= 2048,
+            f"image_size {self.image_size} outside [16, 2048]; 0 takes none",
+        )
         for name, low in (("replans", 0), ("horizon", 1), ("history", 1), ("examples", 0)):
             require(getattr(self, name) >= low, f"{name} {getattr(self, name)} must be at least {low}")
         needs = self.kind in ("llm_planner", "rap")
@@ -142,6 +145,9 @@ class EvalConfig:
         contingencies: outcome distributions, a name of `configs/contingency` or of one's own assets.
         category: tasks of one category, or all.
         trials: episodes per task; the luck and the random streams differ between trials.
+        steps: charged steps of an episode, 50 in the paper; `task` ends it at the task's time limit.
+        stuck: an episode ends when its last so many steps only repeat one or two with the same outcome and change nothing; 0
+            lets it run on.
         start: `fixed` starts where the task says, `turned` there with a heading drawn per trial, `random` anywhere free in the
             room with heading and pelvis height drawn per trial.
         split: tasks whose `split` this is, or all.
@@ -169,6 +175,8 @@ class EvalConfig:
     contingencies: str = "default"
     category: CategoryName = "all"
     trials: int = 1
+    steps: int | Literal["task"] = 50
+    stuck: int = 8
     start: StartName = "fixed"
     split: SplitName = "all"
     workers: int = 2
@@ -188,6 +196,8 @@ class EvalConfig:
 
     def __post_init__(self) -> None:
         require(self.trials > 0, f"trials {self.trials} must be positive")
+        require(self.steps == "task" or 1 <= self.steps <= 1000, f"steps {self.steps} outside [1, 1000]; allowed too: task")
+        require(self.stuck == 0 or 4 <= self.stuck <= 1000, f"stuck {self.stuck} must be 0 or in [4, 1000]")
         require(0 <= self.workers <= 4096, f"workers {self.workers} outside [0, 4096]")
         require(1 <= self.batch <= 1024, f"batch {self.batch} outside [1, 1024]")
         require(self.scheduler == "local" or self.workers > 0, f"workers {self.workers} must be positive with scheduler=ray")

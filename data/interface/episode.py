@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Final
 
 from data.interface.failures import FailureCategory
 
-__all__ = ["EpisodeRecord", "Outcome"]
+__all__ = ["STEP_LIMIT", "EpisodeRecord", "Outcome"]
+
+#: Environment steps of an episode. Paper: 50.
+STEP_LIMIT: Final = 50
 
 
 class Outcome(StrEnum):
@@ -25,10 +29,10 @@ class EpisodeRecord:
 
     Attributes:
         planner, robot, task, category, difficulty, trial, seed, config_hash: the episode's key.
-        outcome: how it ended.
+        outcome: how it ended; success is success within the run's step limit.
         failure: the one category of a failed episode, None otherwise.
         invalid_output: number of planner replies outside the grammar.
-        budget_exhausted: whether the step budget ran out.
+        budget_exhausted: whether the step limit ended a failed episode.
         goal_conditions_met: fraction of goal predicates that held at the end, in [0, 1].
         steps: environment steps taken.
         makespan_s: simulated seconds.
@@ -41,6 +45,8 @@ class EpisodeRecord:
         reflections: calls that reflected on a failure.
         planner_usd: price of all calls when they were made, None where it is not known.
         models: exact language models that answered.
+        in_time: whether it succeeded within the task's own time limit.
+        stuck: whether it was ended because it only repeated itself.
     """
 
     planner: str
@@ -70,3 +76,5 @@ class EpisodeRecord:
     reflections: int = 0
     planner_usd: float | None = 0.0
     models: tuple[str, ...] = ()
+    in_time: bool = False
+    stuck: bool = False

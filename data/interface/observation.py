@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data.interface.episode import STEP_LIMIT
+
 __all__ = ["Camera", "HistoryItem", "Observation", "Proprioception"]
 
 
@@ -72,7 +74,8 @@ class Observation:
         proprioception: the robot's own state.
         history: earlier steps with their feedback, oldest first.
         step: index of the coming step.
-        step_budget: number of steps the task allows.
+        time_limit: steps within which the task is done in time.
+        step_limit: steps after which the episode ends.
     """
 
     instruction: str
@@ -84,4 +87,5 @@ class Observation:
     proprioception: Proprioception
     history: tuple[HistoryItem, ...]
     step: int
-    step_budget: int
+    time_limit: int
+    step_limit: int = STEP_LIMIT

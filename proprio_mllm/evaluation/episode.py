@@ -1,8 +1,8 @@
 """Runs one episode: a session, a planner, and the record of what became of it.
 
-The loop: show the observation, ask for a step, let the session act it out, until the goals hold, the planner says `Done()`, or
-the step budget is used up. A reply outside the grammar costs a step and comes back as the code `InvalidOutput`. The runner
-keeps history and step count itself, so that invalid replies are part of both.
+The loop: show the observation, ask for a step, let the session act it out, until the goals hold, the planner says `Done()`, the
+steps run out, or the episode only repeats itself. A reply outside the grammar costs a step and comes back as the code
+`InvalidOutput`. The runner keeps history and step count itself, so that invalid replies are part of both.
 
 Every exception is caught here (elsewhere only around a user's planner file): whatever breaks in simulator or planner becomes an
 infrastructure error, which is recorded and never scored.
@@ -16,13 +16,14 @@ import math
 import operator
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 
-from data.interface.episode import EpisodeRecord, Outcome
+from data.interface.episode import STEP_LIMIT, EpisodeRecord, Outcome
 from data.interface.feedback import Feedback
 from data.interface.observation import HistoryItem, Observation
 from data.interface.steps import PlanStep
@@ -36,6 +37,7 @@ __all__ = [
     "Episode",
     "EpisodeKeyFields",
     "GoalReport",
+    "Limits",
     "RunnableSession",
     "Stats",
     "Watcher",
@@ -45,6 +47,29 @@ __all__ = [
 ]
 
 logger = logging.getLogger(__name__)
+
+#: A robot that is not farther from where it was, in metres and radians, has not moved.
+_MOVED: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What ends an episode. Steps that a contingency spoils are acted out and recorded, but not charged.
+
+    Attributes:
+        time: the task's time limit: charged steps within which a success is in time.
+        steps: charged steps after which the episode ends.
+        stuck: steps after which an episode that only repeats itself ends; 0 lets it run.
+    """
+
+    time: int
+    steps: int = STEP_LIMIT
+    stuck: int = 0
+
+    @staticmethod
+    def of(time_limit: int, steps: int | Literal["task"], stuck: int = 0) -> Limits:
+        """Limits of a task; `steps` is a number, or `task` for the task's time limit."""
+        return Limits(time_limit, time_limit if steps == "task" else steps, stuck)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +111,10 @@ class RunnableSession(Protocol):
 
     def stats(self) -> Stats:
         """Costs so far."""
+        ...
+
+    def stance(self) -> tuple[float, float, float, float]:
+        """x, y (m), yaw (rad) and pelvis height (m) of the robot in the world."""
         ...
 
     def relations(self) -> Mapping[str, Sequence[str]]:
@@ -136,7 +165,7 @@ def run_episode(
     planner: Planner,
     fields: EpisodeKeyFields,
     instruction: str,
-    step_budget: int,
+    limits: Limits,
     episode_seed: int,
     watch: Watcher | None = None,
 ) -> EpisodeRecord:
@@ -145,7 +174,7 @@ def run_episode(
     Returns:
         The record; on any exception one with the outcome `INFRASTRUCTURE_ERROR` and the error's text.
     """
-    episode = episode_steps(open_session, fields, instruction, step_budget, episode_seed, watch)
+    episode = episode_steps(open_session, fields, instruction, limits, episode_seed, watch)
     said: PlannerReply | Exception | None = None
     try:
         while True:
@@ -169,7 +198,7 @@ def episode_steps(
     open_session: Callable[[], RunnableSession],
     fields: EpisodeKeyFields,
     instruction: str,
-    step_budget: int,
+    limits: Limits,
     episode_seed: int,
     watch: Watcher | None = None,
 ) -> Episode:
@@ -179,7 +208,7 @@ def episode_steps(
         open_session: makes the session; called inside the guarded part.
         fields: the episode's key.
         instruction: the task's instruction.
-        step_budget: steps allowed, without those that a contingency spoils: they are acted out and recorded, not charged.
+        limits: what ends it.
         episode_seed: the episode's seed (`seeds.episode_seed`), for the session and the planner's random stream.
         watch: sees every observation.
 
@@ -194,8 +223,8 @@ def episode_steps(
     try:
         session = open_session()
         observation = session.reset(episode_seed)
-        yield Begin(TaskInfo(instruction, fields.robot, step_budget), stream(episode_seed, "planner"))
-        done = yield from _loop(session, observation, step_budget, tally, watch)
+        yield Begin(TaskInfo(instruction, fields.robot, limits.time, limits.steps), stream(episode_seed, "planner"))
+        end = yield from _loop(session, observation, limits, tally, watch)
         goals, stats = session.goals(), session.stats()
     except Exception as error:  # noqa: BLE001  # an episode must never end the run; the record tells what happened
         logger.warning("%s on %s, trial %d: %s", fields.planner, fields.task, fields.trial, error)
@@ -206,7 +235,9 @@ def episode_steps(
         _record(fields, tally, time.perf_counter() - started),
         outcome=Outcome.SUCCESS if success else Outcome.FAILURE,
         failure=None if success else attribute(tally.trace, goals.unmet_objects),
-        budget_exhausted=not success and not done,
+        budget_exhausted=not success and end == "steps",
+        stuck=not success and end == "stuck",
+        in_time=success and tally.charged <= limits.time,
         goal_conditions_met=sum(goals.met) / len(goals.met),
         makespan_s=round(stats.makespan_s, 3),
         path_length_m=round(stats.path_length_m, 3),
@@ -220,6 +251,7 @@ class _Tally:
     def __init__(self) -> None:
         self.trace: list[dict[str, Any]] = []
         self.invalid = 0
+        self.charged = 0
         self.usage = Usage()
         self.tokens = 0
         self.planner_s = 0.0
@@ -249,21 +281,53 @@ def _finite(name: str, value: float) -> float:
     return float(value)
 
 
+class _Repetition:
+    """Whether the last steps repeat the same one or two with the same outcome, and left everything as it was.
+
+    Args:
+        steps: how many; 0 never says so.
+    """
+
+    def __init__(self, steps: int) -> None:
+        self._steps = steps
+        self._marks: deque[tuple[object, tuple[float, ...]]] = deque(maxlen=max(steps, 1))
+
+    def seen(self, session: RunnableSession, observation: Observation, item: HistoryItem, met: Sequence[bool]) -> None:
+        """Takes a step that no bad luck struck."""
+        if self._steps:
+            x, y, yaw, height = session.stance()
+            place = (x, y, math.cos(yaw), math.sin(yaw), height)
+            self._marks.append(((item, observation.visible_objects, observation.known_objects, tuple(met)), place))
+
+    def forget(self) -> None:
+        """Starts anew: the same step may come out otherwise next time."""
+        self._marks.clear()
+
+    @property
+    def stuck(self) -> bool:
+        """Whether it is so."""
+        marks = list(self._marks)
+        return 0 < len(marks) == self._steps and all(
+            now[0] == before[0] and math.dist(now[1], before[1]) < _MOVED for before, now in zip(marks, marks[2:], strict=False)
+        )
+
+
 def _loop(
     session: RunnableSession,
     observation: Observation,
-    step_budget: int,
+    limits: Limits,
     tally: _Tally,
     watch: Watcher | None,
-) -> Generator[Ask, PlannerReply | None, bool]:
-    """Steps until the end; returns whether the planner ended the episode itself."""
+) -> Generator[Ask, PlannerReply | None, Literal["goals", "done", "steps", "stuck"]]:
+    """Steps until the end; returns what ended the episode."""
     history: list[HistoryItem] = []
     reply: PlannerReply | None = None
     feedback: Feedback | None = None
-    ended = False
-    charged = 0
-    while charged < step_budget:
-        shown = _shown(observation, history, charged, step_budget)
+    met: Sequence[bool] = ()
+    repetition = _Repetition(limits.stuck)
+    end: Literal["goals", "done", "steps", "stuck"] = "steps"
+    while tally.charged < limits.steps:
+        shown = _shown(observation, history, tally.charged, limits)
         if watch is not None:
             watch(shown, reply, feedback)
         reply = yield Ask(shown, None if feedback is None else feedback.public())
@@ -272,26 +336,37 @@ def _loop(
         tally.add(reply)
         if reply.step is None:
             feedback = None
-            charged += 1
+            tally.charged += 1
             tally.invalid += 1
             text = " ".join(reply.text.split())[:80]
             history.append(HistoryItem(text, f"{text} {INVALID_OUTPUT}".strip()))
             tally.trace.append(_invalid(reply))
-            continue
-        observation, feedback = session.step(reply.step)
-        charged += not feedback.struck
-        history.append(HistoryItem(reply.step.to_text(), feedback.to_text()))
-        tally.trace.append(_traced(reply.step, feedback))
-        ended = any(action.name == "Done" for action in reply.step.actions)
-        if ended or all(session.goals().met):
+        else:
+            observation, feedback = session.step(reply.step)
+            tally.charged += not feedback.struck
+            history.append(HistoryItem(reply.step.to_text(), feedback.to_text()))
+            tally.trace.append(_traced(reply.step, feedback))
+            met = session.goals().met
+            if any(action.name == "Done" for action in reply.step.actions):
+                end = "done"
+                break
+            if all(met):
+                end = "goals"
+                break
+        if feedback is not None and feedback.struck:
+            repetition.forget()
+        else:
+            repetition.seen(session, observation, history[-1], met)
+        if repetition.stuck:
+            end = "stuck"
             break
     if watch is not None:
-        watch(_shown(observation, history, charged, step_budget), reply, feedback)
-    return ended
+        watch(_shown(observation, history, tally.charged, limits), reply, feedback)
+    return end
 
 
-def _shown(observation: Observation, history: list[HistoryItem], step: int, step_budget: int) -> Observation:
-    return dataclasses.replace(observation, history=tuple(history), step=step, step_budget=step_budget)
+def _shown(observation: Observation, history: list[HistoryItem], step: int, limits: Limits) -> Observation:
+    return dataclasses.replace(observation, history=tuple(history), step=step, time_limit=limits.time, step_limit=limits.steps)
 
 
 def _invalid(reply: PlannerReply) -> dict[str, Any]:

@@ -21,9 +21,14 @@ from data.interface.episode import EpisodeRecord, Outcome
 
 __all__ = ["LEDGER_VERSION", "EpisodeKey", "Ledger", "LedgerError", "key_of", "read_ledger", "scored"]
 
-LEDGER_VERSION: Final = 2
-#: Fields that lines of version 1 lack; the record's own defaults stand in.
-_SINCE_2: Final = frozenset(("cached_calls", "reflections", "planner_usd", "models"))
+LEDGER_VERSION: Final = 3
+#: Fields that lines of older versions lack; the record's own defaults stand in.
+_SINCE_3: Final = frozenset({"in_time", "stuck"})
+_LACKING: Final = {
+    1: _SINCE_3 | frozenset(("cached_calls", "reflections", "planner_usd", "models")),
+    2: _SINCE_3,
+    LEDGER_VERSION: frozenset(),
+}
 
 #: (planner, robot, task, difficulty, trial, seed, config hash)
 EpisodeKey = tuple[str, str, str, str, int, int, str]
@@ -52,16 +57,16 @@ def to_json(record: EpisodeRecord) -> dict[str, Any]:
 
 
 def from_json(raw: Mapping[str, Any]) -> EpisodeRecord:
-    """Reads `to_json` back, and lines of version 1.
+    """Reads `to_json` back, and lines of versions 1 and 2.
 
     Raises:
         LedgerError: on another version, missing or unknown fields, or a value of another type.
     """
     values = dict(raw)
     version = values.pop("version", None)
-    if version not in (1, LEDGER_VERSION):
-        raise LedgerError(f"ledger version {version!r} is unknown; this code reads 1 and {LEDGER_VERSION}")
-    names = {f.name for f in dataclasses.fields(EpisodeRecord)} - (_SINCE_2 if version == 1 else frozenset())
+    if version not in _LACKING:
+        raise LedgerError(f"ledger version {version!r} is unknown; this code reads {', '.join(map(str, _LACKING))}")
+    names = {f.name for f in dataclasses.fields(EpisodeRecord)} - _LACKING[version]
     if set(values) != names:
         raise LedgerError(f"missing fields {sorted(names - set(values))}, unknown fields {sorted(set(values) - names)}")
     try:

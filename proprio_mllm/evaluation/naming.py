@@ -12,7 +12,7 @@ from typing import Any, Final
 from configs.compose import group_file
 from configs.schema.backend import BackendConfig
 from configs.schema.checks import defaults_of
-from configs.schema.eval import PlannerConfig
+from configs.schema.eval import EvalConfig, PlannerConfig
 
 __all__ = ["as_published", "options_of"]
 
@@ -31,12 +31,16 @@ def options_of(config: Mapping[str, Any]) -> list[str]:
     category, split, start = (config.get(name, "all") for name in ("category", "split", "start"))
     trials, limit, seed = config.get("trials", 1), config.get("limit"), config.get("seed", 0)
     tasks, contingencies = config.get("tasks", "benchmark"), config.get("contingencies", "default")
+    usual = defaults_of(EvalConfig)
+    steps, stuck = (config.get(name, usual[name]) for name in ("steps", "stuck"))
     said = (
         (category, category != "all"),
         (f"trials{trials}", trials != 1),
         (f"limit{limit}", limit is not None),
         (contingencies, contingencies != "default"),
         (start, start not in ("all", "fixed")),
+        (f"steps_{steps}", steps != usual["steps"]),
+        (f"stuck{stuck}", stuck != usual["stuck"]),
         (split, split != "all"),
         ("no_reflection", planner.get("reflection", "on") == "off"),
         ("body", planner.get("body", False)),

@@ -78,7 +78,7 @@ def collect_rollouts(
         jobs = _jobs(request, tasks, robots, difficulty)
         parts = {i: jobs[i * _PER_PART : (i + 1) * _PER_PART] for i in missing}
         planner = PlannerConfig("actor", "mllm", "Actor", str(request.model), temperature=request.temperature)
-        setup = WorkerSetup(planner, difficulty, "fixed")
+        setup = WorkerSetup(planner, difficulty, "fixed", steps="task")
         make = functools.partial(EpisodeWorker, setup) if opener is None else functools.partial(EpisodeWorker, setup, opener)
         _run_parts(writer, parts, make, min(workers, os.cpu_count() or 1), len(jobs))
     if not writer.manifest.complete:

@@ -44,6 +44,7 @@ from proprio_mllm.planners.memory import MEMORY_FILE, check_memory
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.planners.registry import make_chat_planner, make_planner
 from sim.robots.spec import load_robot
+from sim.scene.compiler import PHYSICS
 from sim.session.contingency import load_contingency
 from sim.tasks.task import Task, load_benchmark, read_tasks
 
@@ -143,6 +144,7 @@ def config_hash(cfg: EvalConfig, digest: str) -> str:
         if cfg.planner.kind not in CHAT_KINDS and planner[name] == defaults[name]:
             del planner[name]
     decides = {"planner": planner, "weights": digest, "robot": dataclasses.asdict(cfg.robot), "start": cfg.start}
+    decides |= {"steps": cfg.steps, "stuck": cfg.stuck, "physics": PHYSICS}
     decides["contingencies"] = _contingencies_hash(cfg)
     if cfg.backend is not None:
         own = {name: getattr(cfg.backend, name) for name in ("max_tokens", "temperature", "image_size")}
@@ -209,6 +211,7 @@ def _label(cfg: EvalConfig) -> str:
 def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, own_hash: str) -> dict[str, Any]:
     return {
         "version": RUN_VERSION,
+        "physics": PHYSICS,
         "planner": cfg.planner.name,
         "label": _label(cfg),
         "privileged": cfg.planner.kind == "expert",
@@ -221,6 +224,8 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, own_hash
         "limit": cfg.limit,
         "start": cfg.start,
         "split": cfg.split,
+        "steps": cfg.steps,
+        "stuck": cfg.stuck,
         "seed": cfg.seed,
         "tasks": cfg.tasks,
         "weights": cfg.planner.weights,
@@ -319,7 +324,10 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
     folder.mkdir(parents=True, exist_ok=True)
     metadata = _metadata(cfg, jobs, digest, own_hash)
     shared = str(folder.absolute())
-    setup = WorkerSetup(planner, cfg.difficulty, cfg.start, cfg.contingencies, None, cfg.backend, shared, cfg.cost_cap_usd)
+    setup = WorkerSetup(
+        planner, cfg.difficulty, cfg.start, cfg.contingencies, None, cfg.backend, shared, cfg.cost_cap_usd,
+        cfg.steps, cfg.stuck,
+    )  # fmt: skip
     path = folder / "ledger.jsonl"
     with Ledger(path) as ledger:
         write_text(folder / "run.json", json.dumps(metadata, indent=1) + "\n")  # not while another process runs what it says
@@ -348,7 +356,7 @@ def _run_missing(
     missing = [job for job in jobs if _fields_key(job) not in scores]
     if known:
         logger.info("%d of %d episodes are already in %s", len(known), len(jobs), path)
-    order = sorted(missing, key=lambda job: -job.task.step_budget)
+    order = sorted(missing, key=lambda job: -job.task.time_limit)
     solved = sum(record.outcome is Outcome.SUCCESS for record in known)
     title = f"{cfg.planner.name} {cfg.robot.name} {cfg.difficulty}"
     with (

@@ -54,6 +54,11 @@ class SimSession:
         stats = self.session.stats
         return Stats(float(stats.path_length_m), float(stats.makespan_s), float(stats.arm_utilisation))
 
+    def stance(self) -> tuple[float, float, float, float]:
+        """x, y (m), yaw (rad) and pelvis height (m) of the robot in the world."""
+        x, y, height, yaw = map(float, self.session.world.servos.base_pose[:4])
+        return x, y, yaw, height
+
     def relations(self) -> Mapping[str, Sequence[str]]:
         """What holds of which objects now, from the simulator's metadata."""
         found: dict[str, list[str]] = defaultdict(list)

@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
 from configs.schema.backend import BackendConfig
 from configs.schema.eval import DifficultyName, PlannerConfig, StartName
 from configs.schema.robot import RobotConfig
-from data.interface.episode import EpisodeRecord, Outcome
+from data.interface.episode import STEP_LIMIT, EpisodeRecord, Outcome
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest, CostCapError, UnreachableError
 from proprio_mllm.evaluation.asking import answer_all
 from proprio_mllm.evaluation.episode import (
@@ -26,6 +26,7 @@ from proprio_mllm.evaluation.episode import (
     Begin,
     Episode,
     EpisodeKeyFields,
+    Limits,
     RunnableSession,
     answer,
     episode_steps,
@@ -57,6 +58,7 @@ class WorkerSetup:
         backend: the language model that a planner which chats asks.
         folder: of the run, where its processes share what they may spend and how many calls go on at once.
         cap_usd: most money the run may spend.
+        steps, stuck: see `EvalConfig`.
     """
 
     planner: PlannerConfig
@@ -67,6 +69,8 @@ class WorkerSetup:
     backend: BackendConfig | None = None
     folder: str = ""
     cap_usd: float | None = None
+    steps: int | Literal["task"] = STEP_LIMIT
+    stuck: int = 0
 
 
 class PlannerServer(Protocol):
@@ -200,12 +204,13 @@ class EpisodeWorker:
     def _started(self, job: EpisodeJob) -> _Running:
         recorder, opened = _recorder() if job.record else None, list[RunnableSession]()
         task, watch = job.task, None if recorder is None else recorder.watch
+        limits = Limits.of(task.time_limit, self.setup.steps, self.setup.stuck)
 
         def open_session() -> RunnableSession:
             opened.append(self._opener(self.setup, job, self.planner))
             return opened[-1]
 
-        episode = episode_steps(open_session, job.fields, task.instruction, task.step_budget, job.episode_seed, watch)
+        episode = episode_steps(open_session, job.fields, task.instruction, limits, job.episode_seed, watch)
         one = _Running(job, episode, recorder, opened)
         one.go_on(None)
         return one

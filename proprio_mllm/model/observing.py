@@ -50,7 +50,7 @@ def plan_example(
         observation.known_objects,
         observation.history,
         observation.step,
-        observation.step_budget,
+        observation.time_limit,
         motion_codes(observation, cfg, motion),
         cfg.prompt,
         cfg.history,

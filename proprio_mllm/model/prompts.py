@@ -97,7 +97,7 @@ def plan_prompt(
     known: Sequence[str],
     history: Sequence[HistoryItem],
     step: int,
-    step_budget: int,
+    time_limit: int,
     motion: Sequence[int] | None = None,
     style: Style = "terse",
     last: int = 4,
@@ -112,7 +112,7 @@ def plan_prompt(
         known: ids seen so far; those in view are not repeated.
         history: earlier steps, oldest first; the newest `last` are shown.
         step: index of the coming step, from 0.
-        step_budget: steps that the task allows.
+        time_limit: steps that the task allows.
         motion: motion tokens of the last seconds, None leaves proprioception out.
         style: terse or full.
         last: number of earlier steps shown.
@@ -122,13 +122,13 @@ def plan_prompt(
     other = _elsewhere(visible, known)
     if style == "terse":
         head = (
-            f"{_body(motion, style)}{robot} {step + 1}/{step_budget} {instruction}\n"
+            f"{_body(motion, style)}{robot} {step + 1}/{time_limit} {instruction}\n"
             f"see {_ids(visible, style)}\nknow {_ids(other, style)}\ndid\n"
         )
         tail = ""
     else:
         head = (
-            f"{_body(motion, style)}Robot: {robot}. Step {step + 1} of {step_budget}.\nTask: {instruction}\n"
+            f"{_body(motion, style)}Robot: {robot}. Step {step + 1} of {time_limit}.\nTask: {instruction}\n"
             f"In view: {_ids(visible, style)}\nKnown elsewhere: {_ids(other, style)}\nLast steps:\n"
         )
         tail = "\nNext step?"

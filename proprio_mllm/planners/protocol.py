@@ -15,6 +15,7 @@ from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
+from data.interface.episode import STEP_LIMIT
 from data.interface.feedback import Feedback
 from data.interface.observation import HistoryItem, Observation
 from data.interface.steps import ActionError, PlanStep
@@ -40,12 +41,14 @@ class TaskInfo:
     Attributes:
         instruction: the task in natural language.
         robot: robot name.
-        step_budget: steps that the task allows.
+        time_limit: steps within which the task is done in time.
+        step_limit: steps after which the episode ends.
     """
 
     instruction: str
     robot: str
-    step_budget: int
+    time_limit: int
+    step_limit: int = STEP_LIMIT
 
 
 @dataclass(frozen=True, slots=True)

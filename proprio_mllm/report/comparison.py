@@ -29,10 +29,11 @@ Pair = tuple[EpisodeRecord, EpisodeRecord]
 
 _FIGURES: Final[Mapping[str, Callable[[EpisodeRecord], float]]] = {
     "success": lambda record: float(record.outcome is Outcome.SUCCESS),
+    "in_time": lambda record: float(record.in_time),
     "goal_conditions": lambda record: record.goal_conditions_met,
     "steps": lambda record: float(record.steps),
 }
-_SAME_LUCK: Final = ("robot", "difficulty", "start", "seed", "contingencies")
+_SAME_LUCK: Final = ("robot", "difficulty", "start", "steps", "seed", "contingencies")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +43,8 @@ class RunComparison:
     Attributes:
         kind: `planners` (same body, tasks and luck) or `bodies`.
         names: label, robot and folder of the two.
-        rows: by category and `all`, then by figure: `success`, `goal_conditions`, `steps`, and `steps_both_solved`, which is
-            left out where no episode was solved by both.
+        rows: by category and `all`, then by figure: `success`, `in_time`, `goal_conditions`, `steps`, and `steps_both_solved`,
+            which is left out where no episode was solved by both.
         pairs: the episodes behind it.
         left_out: planned episodes of either run that are not part of it.
     """
@@ -104,7 +105,7 @@ def compare_bodies(a: Run, b: Run) -> RunComparison:
     """
     differing = [
         f"{name}: {a.metadata[name]!r} and {b.metadata[name]!r}"
-        for name in ("planner", "weights_digest", "difficulty", "start", "seed", "contingencies")
+        for name in ("planner", "weights_digest", "difficulty", "start", "steps", "seed", "contingencies")
         if a.metadata.get(name) != b.metadata.get(name)
     ]
     if a.metadata["robot"] == b.metadata["robot"]:

@@ -23,12 +23,13 @@ __all__ = ["episode_digest", "run_digest"]
 #: Fields of a record that are shown as they are.
 _FIELDS: Final = (
     "planner", "robot", "task", "category", "difficulty", "trial", "seed", "config_hash", "invalid_output", "budget_exhausted",
+    "stuck", "in_time",
     "goal_conditions_met", "steps", "makespan_s", "path_length_m", "arm_utilisation", "planner_calls", "planner_tokens",
     "planner_s", "wall_s", "message",
 )  # fmt: skip
 _PROVENANCE: Final = (
-    "planner", "label", "privileged", "robot", "difficulty", "contingencies", "category", "trials", "limit", "start", "seed",
-    "tasks", "weights_digest", "config_hash", "command",
+    "planner", "label", "privileged", "physics", "robot", "difficulty", "contingencies", "category", "trials", "limit", "start",
+    "steps", "stuck", "seed", "tasks", "weights_digest", "config_hash", "command",
 )  # fmt: skip
 
 
@@ -76,7 +77,7 @@ def episode_digest(record: EpisodeRecord, task: Task | None, acted: ActedOut | N
         "instruction": "" if task is None else task.instruction,
         "family": "" if task is None else task.family,
         "room": "" if task is None else task.room,
-        "step_budget": None if task is None else task.step_budget,
+        "time_limit": None if task is None else task.time_limit,
         "struck": sum(any(outcome["contingency"] for outcome in step["outcomes"]) for step in trace),
         "why": _why(record, trace, goals, task),
         "goals": goals,
@@ -139,7 +140,9 @@ def _why(
         return {"step": None, "outcome": None, "text": "Which goals were open at the end is known once it is acted out again."}
     found = deciding_failure(trace, unmet)
     if found is None:
-        end = "the steps ran out" if record.budget_exhausted else "the planner said Done()"
+        end = "the planner said Done()"
+        if record.budget_exhausted or record.stuck:
+            end = "the steps ran out" if record.budget_exhausted else "the same steps changed nothing any more"
         return {"step": None, "outcome": None, "text": f"No failure stands: the plan was wrong or ended too early; {end}."}
     return {"step": found.step + 1, "outcome": found.outcome, "text": _sentence(found, trace)}
 

@@ -6,7 +6,7 @@ and the figures of failure types and of the benchmark's distributions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ from data.files import write_text
 from proprio_mllm.report.figures import distribution_figures, failure_figure
 from proprio_mllm.report.paper import PAPER_ROWS, paper_ablation, paper_main, paper_replanning
 from proprio_mllm.report.runs import Run, find_runs, newest
-from proprio_mllm.report.table import Table, rate_cell
+from proprio_mllm.report.table import Table, in_time_cell, rate_cell
 
 __all__ = ["EXPERIMENTS", "ablation_table", "assemble", "main_table", "replanning_table"]
 
@@ -83,13 +83,19 @@ def _costs(shown: Sequence[Run]) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def _rate(run: Run | None, category: str) -> str:
-    """A cell of ours; of a run that is not finished it says how many episodes there will be."""
+def _rates(run: Run | None, category: str) -> tuple[str, str]:
+    """Success and success in time; of a run that is not finished they say how many episodes there will be."""
     row = None if run is None else run.row(category)
     if run is None or row is None:
-        return ""
+        return "", ""
     planned = run.planned(category)
-    return rate_cell(row) if row.episodes == planned else f"{rate_cell(row)} of {planned}"
+    rest = "" if row.episodes == planned else f" of {planned}"
+    return rate_cell(row) + rest, in_time_cell(row) + rest
+
+
+def _columns(places: Iterable[str]) -> list[str]:
+    """Headings of `_rates` of each place."""
+    return [f"{place}{suffix}" for place in places for suffix in ("", " in time")]
 
 
 def _filled(rows: Sequence[_Row]) -> Sequence[_Row]:
@@ -120,12 +126,13 @@ def _left_out(
 def _own_row(title: str, cells: Sequence[tuple[Run | None, str]]) -> tuple[str, ...]:
     """A row of ours from (run, category) per cell."""
     shown = [run for run, _ in cells if run is not None]
-    return (title, "ours", *(_rate(run, category) for run, category in cells), *_costs(shown))
+    return (title, "ours", *(text for run, category in cells for text in _rates(run, category)), *_costs(shown))
 
 
 def _paper_row(method: str, values: Mapping[Any, float], places: Sequence[Any]) -> tuple[str, ...]:
     """A row of the paper's figures; it names no costs."""
-    return (method, "paper", *(f"{values[place]:.2f}" if place in values else "" for place in places), *("",) * len(_COSTS))
+    cells = (text for place in places for text in (f"{values[place]:.2f}" if place in values else "", ""))
+    return (method, "paper", *cells, *("",) * len(_COSTS))
 
 
 def main_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
@@ -145,11 +152,11 @@ def main_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
         if method is not None:
             body.append(_paper_row(method, paper.pop(method), places))
     body += [_paper_row(method, values, places) for method, values in paper.items()]
-    columns = ("planner", "source", *(f"{category} {robot}" for category, robot in places), *_COSTS)
+    columns = ("planner", "source", *_columns(f"{category} {robot}" for category, robot in places), *_COSTS)
     notes = (
-        "ours: success in %, 95 % interval over tasks, successes/episodes, `of N` in a run that is not finished. calls, "
-        "tokens, USD: means per episode; invalid: share of calls; broken: attempts that failed for reasons outside the "
-        "planner, run again and not scored.",
+        "ours: success within 50 steps, and within the task's own time limit (in time), in %, 95 % interval over tasks, "
+        "successes/episodes, `of N` in a run that is not finished. calls, tokens, USD: means per episode; invalid: share of "
+        "calls; broken: attempts that failed for reasons outside the planner, run again and not scored.",
         _PAPER_NOTE,
         *_left_out(cfg, (difficulty,), cfg.robots, runs, shown),
     )
@@ -181,7 +188,7 @@ def replanning_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
             if values is not None:
                 body.append(_paper_row(f"{method}{suffix}", values, cfg.difficulties))
     body += [_paper_row(method, values, cfg.difficulties) for method, values in paper.items()]
-    columns = ("planner", "source", *cfg.difficulties, *_COSTS)
+    columns = ("planner", "source", *_columns(cfg.difficulties), *_COSTS)
     notes = (
         "Low-level skills succeed in 100 % (easy), 50 % (medium), 20 % (hard) of the cases. Without reflection: see "
         "docs/planners.md for what each planner then leaves out.",
@@ -202,9 +209,9 @@ def ablation_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
         shown.append(run)
         row = None if run is None else run.row("essential")
         own = (
-            ("", "", "", "")
+            ("", "", "", "", "")
             if row is None
-            else (_rate(run, "essential"), *map(str, (row.navigation, row.body_adjustment, row.logical)))
+            else (*_rates(run, "essential"), *map(str, (row.navigation, row.body_adjustment, row.logical)))
         )
         values = paper.get(PAPER_ROWS.get(name, (None, None, None))[2] or "")
         printed = ("", "", "", "")
@@ -213,7 +220,7 @@ def ablation_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
             printed = (f"{values['success_percent']:.2f}", *counts)
         body.append((_label(name), *own, *printed))
     kinds = ("success", "navigation", "body adj.", "logical")
-    columns = ("planner", *kinds, *(f"paper {kind}" for kind in kinds))
+    columns = ("planner", "success", "in time", *kinds[1:], *(f"paper {kind}" for kind in kinds))
     left_out = _left_out(cfg, (difficulty,), (robot,), runs, shown)
     notes = ("The paper counts failures over 133 tasks x 50 trials.", _PAPER_NOTE, *left_out)
     return Table(f"Ablation, dual-arm essential, {robot}, {difficulty}", columns, tuple(body), notes)

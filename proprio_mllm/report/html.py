@@ -120,6 +120,7 @@ def run_data(run: Run, frames: FrameChoice, size: int = 160, workers: int = 2) -
 #: What the list and its filters need of an episode; the rest is read when it is opened.
 _LISTED: Final = (
     "id", "task", "instruction", "category", "family", "room", "robot", "outcome", "failure", "goal_conditions_met", "steps",
+    "in_time",
     "makespan_s", "trial",
 )  # fmt: skip
 

@@ -95,7 +95,7 @@
 
   function badge(episode) {
     const kind = episode.outcome === "infrastructure_error" ? "odd" : episode.outcome;
-    const text = episode.outcome === "failure" ? words(episode.failure) : episode.outcome === "success" ? "success" : "broke";
+    const text = episode.outcome === "failure" ? words(episode.failure) : episode.outcome !== "success" ? "broke" : episode.in_time ? "success" : "success, late";
     return make("span", { class: `badge ${kind}` }, text);
   }
 
@@ -147,7 +147,7 @@
   // ---- the opened episode
 
   const costs = (e) => [
-    ["steps", e.step_budget === null ? e.steps : `${e.steps - e.struck} of ${e.step_budget}`],
+    ["steps", e.time_limit === null ? e.steps : `${e.steps - e.struck}, in time ${e.time_limit}`],
     ...(e.struck ? [["struck by bad luck, not charged", e.struck]] : []),
     ["goals met", `${Math.round(100 * e.goal_conditions_met)} %`],
     ["makespan", `${fixed(e.makespan_s, 1)} s`],

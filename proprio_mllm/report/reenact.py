@@ -20,6 +20,7 @@ from data.interface.feedback import Feedback
 from data.interface.observation import HistoryItem, Observation
 from data.interface.steps import PlanStep
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT
+from proprio_mllm.evaluation.episode import Limits
 from proprio_mllm.evaluation.run import plan_episodes, select_tasks
 from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.starts import started
@@ -150,7 +151,6 @@ class Reenactment:
         cfg = episode.cfg
         self.episode = episode
         robot = cfg.robot.spec or cfg.robot.name
-        # The size of the planner's picture decides what is seen, and so what actions may name.
         self.session = Session(robot, cfg.difficulty, _picture_size(cfg.planner), cfg.contingencies)
         self._first = self.session.reset(
             started(episode.task, cfg.start, episode.episode_seed, robot), seed=episode.episode_seed
@@ -190,8 +190,8 @@ class Reenactment:
         history: Sequence[HistoryItem],
         charged: int,
     ) -> Moment:
-        budget = self.episode.task.step_budget
-        shown = dataclasses.replace(seen, history=tuple(history), step=charged, step_budget=budget)
+        limits = Limits.of(self.episode.task.time_limit, self.episode.cfg.steps)
+        shown = dataclasses.replace(seen, history=tuple(history), step=charged, time_limit=limits.time, step_limit=limits.steps)
         return Moment(number, text, feedback, codes, expected, self.session.goal_status(), shown)
 
 

@@ -74,7 +74,7 @@ def _beside(run: Run, **wanted: object) -> dict[Episode, EpisodeRecord]:
 
     A neighbour that cannot be read is passed by with a warning: it must not cost a finished run its report.
     """
-    same = ("robot", "start", "seed", "contingencies", "contingencies_hash")
+    same = ("robot", "start", "steps", "seed", "contingencies", "contingencies_hash")
     wanted |= {name: run.metadata.get(name) for name in same}
     found: dict[Episode, EpisodeRecord] = {}
     paths = sorted(run.folder.parent.glob("*/run.json"), key=lambda path: (path.stat().st_mtime, path.parent.name))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from configs.schema.checks import defaults_of
+from configs.schema.eval import EvalConfig
 from data.files import write_text
 from proprio_mllm.backends.factory import SPENDING_FILE
 from proprio_mllm.backends.protocol import BackendError
@@ -19,8 +21,8 @@ __all__ = ["Run", "find_runs", "load_run", "newest", "run_notes", "run_report", 
 
 
 def run_notes(run: Run) -> list[str]:
-    """What to know about a run besides its figures: episodes without a score, broken attempts, a privileged planner."""
-    notes = []
+    """What to know about a run besides its figures: its physics, what has no score or broke, a privileged planner."""
+    notes = [f"Made with physics {run.metadata.get('physics', 1)}."]
     missing = len(run.metadata["planned"]) - len(run.records)
     if missing:
         notes.append(f"{missing} of {len(run.metadata['planned'])} episodes have no score.")
@@ -75,9 +77,22 @@ def write_report(run: Run) -> Table:
         "schema_version": SUMMARY_VERSION,
         **{name: meta[name] for name in ("planner", "label", "privileged", "robot", "difficulty", "config_hash")},
         "provenance": {
-            name: meta[name]
-            for name in ("command", "weights", "weights_digest", "tasks", "trials", "category", "limit", "start", "seed")
+            name: meta.get(name)
+            for name in (
+                "command",
+                "weights",
+                "weights_digest",
+                "tasks",
+                "trials",
+                "category",
+                "limit",
+                "start",
+                "steps",
+                "stuck",
+                "physics",
+            )
         }
+        | {"seed": meta["seed"]}
         | {"split": meta.get("split", "all")},
         "complete": run.complete,
         "planned": len(meta["planned"]),
@@ -106,8 +121,9 @@ def newest(
 ) -> Run | None:
     """The run to show in a cell: of these settings, the one with most episodes of the category, then the newest.
 
-    Runs over a part of the tasks (`limit`, `split`), from other start poses, with other rules of luck, with a planner or a
-    backend set otherwise than in its file (`as_published`), or with a script in place of a model are left out.
+    Runs with another number of steps, over a part of the tasks (`limit`, `split`), from other start poses, with other rules of
+    luck, with a planner or a backend set otherwise than in its file (`as_published`), or with a script in place of a model are
+    left out.
 
     Args:
         runs: the newest first.
@@ -123,6 +139,7 @@ def newest(
         for run in runs
         if (run.metadata["planner"], run.metadata["robot"], run.metadata["difficulty"]) == (planner, robot, difficulty)
         and (run.metadata["tasks"], run.metadata["limit"], run.metadata["start"]) == ("benchmark", None, "fixed")
+        and run.metadata.get("steps") == defaults_of(EvalConfig)["steps"]
         and run.metadata["category"] in ("all", category)
         and (run.metadata.get("split", "all"), run.metadata.get("reflection", "on")) == ("all", reflection)
         and not run.machinery

@@ -53,7 +53,7 @@ SFT_COLUMNS: Final[Mapping[str, Any]] = {
     "seed": _INT,
     "episode_success": _BOOL,
     "step": _INT,
-    "step_budget": _INT,
+    "time_limit": _INT,
     "step_success": _BOOL,
     "instruction": _TEXT,
     "visible": datasets.List(_TEXT),
@@ -154,7 +154,7 @@ class _Maker:
         seen, picture = before
         record, task = job.episode.record, job.episode.task
         prompt = plan_prompt(
-            seen.instruction, seen.robot, seen.visible_objects, seen.known_objects, seen.history, seen.step, seen.step_budget,
+            seen.instruction, seen.robot, seen.visible_objects, seen.known_objects, seen.history, seen.step, seen.time_limit,
             style="full", last=self._choice.history,
         )  # fmt: skip
         row: dict[str, Any] = {
@@ -167,7 +167,7 @@ class _Maker:
             "room": task.room,
             "episode_success": record.outcome is Outcome.SUCCESS,
             "step": seen.step,
-            "step_budget": seen.step_budget,
+            "time_limit": seen.time_limit,
             "step_success": success,
             "instruction": seen.instruction,
             "visible": list(seen.visible_objects),

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -54,6 +54,8 @@ class _Metadata(BaseModel):
     limit: int | None
     start: str
     seed: int
+    steps: int | Literal["task"] = "task"
+    stuck: int = 0
     planned: list[tuple[str, str, int, str]]
     config: _Config
     backend: dict[str, Any] | None = None

@@ -9,8 +9,9 @@ broke, not scored); `seconds` (sum of `wall_s` over episodes, `planner` part); a
 | `category` | single, optional, essential, all |
 | `tasks`, `episodes`, `successes` | counts |
 | `success_rate`, `low`, `high`, `interval` | in [0, 1]; 95 % limits over tasks; `wilson`, `bootstrap` or `none` |
+| `in_time`, `in_time_rate`, `in_time_low`, `in_time_high` | successes within the task's time limit, likewise |
 | `navigation`, `body_adjustment`, `logical` | failed episodes by type; they add up to the failures |
-| `budget_exhausted` | failed episodes that used up their steps |
+| `budget_exhausted`, `stuck` | failed episodes that used up their steps; that only repeated themselves and were ended |
 | `invalid_output` | replies outside the grammar; `invalid_rate` is per call |
 | `goal_conditions` | mean share of goals met |
 | `steps`, `makespan_s`, `path_length_m`, `arm_utilisation` | means per episode |
@@ -42,7 +43,7 @@ from proprio_mllm.report.statistics import rate_interval
 
 __all__ = ["CATEGORIES", "SUMMARY_VERSION", "Row", "by_task", "rows_of", "write_json"]
 
-SUMMARY_VERSION: Final = 1
+SUMMARY_VERSION: Final = 2
 #: Order of rows in every table.
 CATEGORIES: Final = ("single", "optional", "essential")
 
@@ -59,10 +60,15 @@ class Row:
     low: float
     high: float
     interval: str
+    in_time: int
+    in_time_rate: float
+    in_time_low: float
+    in_time_high: float
     navigation: int
     body_adjustment: int
     logical: int
     budget_exhausted: int
+    stuck: int
     invalid_output: int
     invalid_rate: float
     goal_conditions: float
@@ -90,12 +96,14 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def by_task(records: Iterable[EpisodeRecord]) -> dict[str, list[bool]]:
-    """Successes per task, trials in order; infrastructure errors are left out."""
+def by_task(
+    records: Iterable[EpisodeRecord], of: Callable[[EpisodeRecord], bool] = lambda record: record.outcome is Outcome.SUCCESS
+) -> dict[str, list[bool]]:
+    """Successes, or whatever is asked for, per task, trials in order; infrastructure errors are left out."""
     found: dict[str, list[bool]] = defaultdict(list)
     for record in sorted(records, key=lambda r: (r.task, r.trial)):
         if record.outcome is not Outcome.INFRASTRUCTURE_ERROR:
-            found[record.task].append(record.outcome is Outcome.SUCCESS)
+            found[record.task].append(of(record))
     return dict(found)
 
 
@@ -107,7 +115,7 @@ def _row(category: str, records: Sequence[EpisodeRecord], references: References
         return sum(record.failure is kind for record in records)
 
     tasks = by_task(records)
-    interval = rate_interval(tasks)
+    interval, in_time = rate_interval(tasks), rate_interval(by_task(records, lambda record: record.in_time))
     calls = sum(record.planner_calls for record in records)
     invalid = sum(record.invalid_output for record in records)
     return Row(
@@ -119,10 +127,15 @@ def _row(category: str, records: Sequence[EpisodeRecord], references: References
         low=interval.low,
         high=interval.high,
         interval=interval.method,
+        in_time=sum(record.in_time for record in records),
+        in_time_rate=in_time.rate,
+        in_time_low=in_time.low,
+        in_time_high=in_time.high,
         navigation=failures(FailureCategory.NAVIGATION),
         body_adjustment=failures(FailureCategory.BODY_ADJUSTMENT),
         logical=failures(FailureCategory.LOGICAL),
         budget_exhausted=sum(record.budget_exhausted for record in records),
+        stuck=sum(record.stuck for record in records),
         invalid_output=invalid,
         invalid_rate=invalid / calls if calls else float("nan"),
         goal_conditions=mean(lambda r: r.goal_conditions_met),

@@ -15,7 +15,7 @@ from rich.table import Table as RichTable
 
 from proprio_mllm.report.summary import Row
 
-__all__ = ["Table", "latex_text", "rate_cell", "run_table"]
+__all__ = ["Table", "in_time_cell", "latex_text", "rate_cell", "run_table"]
 
 _LATEX: Final = {
     "\\": r"\textbackslash{}",
@@ -122,9 +122,16 @@ class Table:
 
 def rate_cell(row: Row) -> str:
     """`63.2 [54.7, 70.9] 84/133`, empty without an episode."""
-    if not row.episodes:
-        return ""
-    return f"{100 * row.success_rate:.1f} [{100 * row.low:.1f}, {100 * row.high:.1f}] {row.successes}/{row.episodes}"
+    return _cell(row.success_rate, row.low, row.high, row.successes, row.episodes)
+
+
+def in_time_cell(row: Row) -> str:
+    """`rate_cell` of the successes in time."""
+    return _cell(row.in_time_rate, row.in_time_low, row.in_time_high, row.in_time, row.episodes)
+
+
+def _cell(rate: float, low: float, high: float, count: int, episodes: int) -> str:
+    return f"{100 * rate:.1f} [{100 * low:.1f}, {100 * high:.1f}] {count}/{episodes}" if episodes else ""
 
 
 def _number(value: float, digits: int = 1) -> str:
@@ -136,12 +143,14 @@ def run_table(title: str, rows: Sequence[Row], notes: Sequence[str] = ()) -> Tab
     columns = (
         "category",
         "success %, 95 % interval",
+        "in time %, 95 % interval",
         "SPL",
         "navigation",
         "body adj.",
         "logical",
         "invalid",
         "budget",
+        "stuck",
         "goals %",
         "calls",
         "tokens",
@@ -150,12 +159,14 @@ def run_table(title: str, rows: Sequence[Row], notes: Sequence[str] = ()) -> Tab
         (
             row.category,
             rate_cell(row),
+            in_time_cell(row),
             _number(100 * row.extras.spl),
             str(row.navigation),
             str(row.body_adjustment),
             str(row.logical),
             str(row.invalid_output),
             str(row.budget_exhausted),
+            str(row.stuck),
             _number(100 * row.goal_conditions),
             _number(row.calls),
             _number(row.tokens, 0),

@@ -245,7 +245,7 @@ def actor_examples(kept: Sequence[Kept], style: Style, last: int) -> list[Exampl
                 moment.known,
                 rollout.history(at),
                 moment.number,
-                rollout.step_budget,
+                rollout.time_limit,
                 t.motion[at],
                 style,
                 last,

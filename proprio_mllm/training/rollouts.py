@@ -102,7 +102,7 @@ class Rollout:
     robot: str
     category: str
     instruction: str
-    step_budget: int
+    time_limit: int
     moments: tuple[Moment, ...]
     motions: tuple[NDArray[np.float32], ...]
     success: bool
@@ -196,7 +196,7 @@ def rollout_row(
         "seed": seed,
         "instruction": first.instruction,
         "difficulty": difficulty,
-        "step_budget": first.step_budget,
+        "time_limit": first.time_limit,
         "steps": json.dumps(moments),
         "images": [encode_png(o.image) for o in observations],
         "motions": [o.proprioception.motion.ravel() for o in observations],
@@ -232,7 +232,7 @@ def read_rollouts(folder: Path) -> list[Rollout]:
                 row["robot"],
                 row["category"],
                 row["instruction"],
-                int(row["step_budget"]),
+                int(row["time_limit"]),
                 moments,
                 motions,
                 bool(row["success"]),

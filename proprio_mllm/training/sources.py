@@ -170,7 +170,7 @@ def _planning(
         row["known"],
         history_of(row),
         int(row["step"]),
-        int(row["step_budget"]),
+        int(row["time_limit"]),
         motion,
         cfg.prompt,
         cfg.history,

@@ -2,7 +2,7 @@
 
 A certificate holds the plan that succeeds at difficulty easy, its simulated time, path and use of the arms, and what the expert
 could do with one arm disabled: essential tasks then fail with either arm, single-arm tasks still succeed with one of them, and
-optional tasks succeed too, but take more steps than the budget allows. The one-armed figures are the expert's, not proven
+optional tasks succeed too, but not within the time limit. The one-armed figures are the expert's, not proven
 optima.
 """
 
@@ -16,20 +16,21 @@ from typing import Any, Final
 import numpy as np
 
 from data.interface.bodies import PAPER_ROBOTS, Arm
+from data.interface.episode import STEP_LIMIT
 from sim.tasks.families import family_of
-from sim.tasks.task import BENCHMARK_PATH, MAX_STEPS, Task
+from sim.tasks.task import BENCHMARK_PATH, Task
 
 __all__ = [
     "CERTIFICATES_PATH",
     "Certificate",
     "Refusal",
-    "budget_of",
     "certificates_table",
     "certificates_text",
     "certified",
     "certify",
     "load_certificates",
     "one_armed_steps",
+    "time_limit_of",
 ]
 
 CERTIFICATES_PATH: Final = BENCHMARK_PATH.with_name("certificates.jsonl")
@@ -85,23 +86,25 @@ class Certificate:
         return Certificate(**{**values, "plan": tuple(values["plan"])})
 
 
-def budget_of(steps: Sequence[int], one_arm: Sequence[int | None] = ()) -> int:
-    """Step budget: 1.5 times the longest plan, rounded up, plus 2, but fewer than one arm takes.
+def time_limit_of(steps: Sequence[int], one_arm: Sequence[int | None] = ()) -> int:
+    """Time limit: 1.5 times the longest plan, rounded up, plus 2, but fewer than one arm takes.
 
     Args:
         steps: the expert's steps on each robot.
-        one_arm: least steps of one arm on each robot that the budget has to stay below; none for other categories.
+        one_arm: least steps of one arm on each robot that the limit has to stay below; none for other categories.
     """
-    budget = min(MAX_STEPS, int(np.ceil(1.5 * max(steps))) + 2)
-    return min([budget, *(steps - 1 for steps in one_arm if steps is not None)])
+    limit = min(STEP_LIMIT, int(np.ceil(1.5 * max(steps))) + 2)
+    return min([limit, *(steps - 1 for steps in one_arm if steps is not None)])
 
 
-def certify(task: Task, robot: str, arms: Sequence[Arm] = (Arm.RIGHT, Arm.LEFT)) -> Certificate | None:
-    """The expert's solution on a robot at difficulty easy within the task's budget, None when it fails."""
+def certify(
+    task: Task, robot: str, arms: Sequence[Arm] = (Arm.RIGHT, Arm.LEFT), step_limit: int = STEP_LIMIT
+) -> Certificate | None:
+    """The expert's solution on a robot at difficulty easy within so many steps, None when it fails."""
     from sim.expert.expert import Expert
     from sim.session.session import Session
 
-    session = Session(robot, "easy", image_size=0)
+    session = Session(robot, "easy", image_size=0, step_limit=step_limit)
     try:
         session.reset(task, seed=task.seed)
         expert = Expert(session, _REHEARSALS if len(arms) == len(Arm) else None, arms)
@@ -126,23 +129,23 @@ def one_armed_steps(task: Task, certificate: Certificate) -> dict[str, int | Non
         if not both and used <= {arm} and not any(" & " in step for step in certificate.plan):
             found[arm.value] = len(certificate.plan)
             continue
-        alone = certify(replace(task, step_budget=MAX_STEPS), certificate.robot, (arm,))
+        alone = certify(task, certificate.robot, (arm,))
         found[arm.value] = None if alone is None else len(alone.plan)
     return found
 
 
 def certified(task: Task, robots: Sequence[str] = PAPER_ROBOTS) -> tuple[Task, tuple[Certificate, ...]]:
-    """The task with its budget, and a certificate per robot.
+    """The task with its time limit, and a certificate per robot.
 
     Raises:
         Refusal: when some robot fails, needs too long, or does not need, or gain from, its arms as the category says.
     """
-    limit = min(MAX_STEPS, family_of(task.family).steps + _EXTRA_STEPS)
+    limit = min(STEP_LIMIT, family_of(task.family).steps + _EXTRA_STEPS)
     proofs: list[Certificate] = []
     steps: list[int] = []
     alone: list[int | None] = []
     for robot in sorted(robots, reverse=True):  # x1, which fails more often, first
-        proof = certify(replace(task, step_budget=limit), robot)
+        proof = certify(task, robot, step_limit=limit)
         if proof is None:
             raise Refusal(f"{robot} does not solve it within {limit} steps")
         proof = replace(proof, one_arm_steps=one_armed_steps(task, proof))
@@ -156,11 +159,11 @@ def certified(task: Task, robots: Sequence[str] = PAPER_ROBOTS) -> tuple[Task, t
         proofs.append(proof)
         steps.append(len(proof.plan))
         alone.append(least)
-    budget = budget_of(steps, alone if task.category == "optional" else ())
-    if budget < max(steps):
+    time_limit = time_limit_of(steps, alone if task.category == "optional" else ())
+    if time_limit < max(steps):
         raise Refusal(f"two arms take {max(steps)} steps, one arm {min(n for n in alone if n is not None)}")
     ordered = sorted(proofs, key=lambda proof: robots.index(proof.robot))
-    return replace(task, step_budget=budget), tuple(ordered)
+    return replace(task, time_limit=time_limit), tuple(ordered)
 
 
 def certificates_text(certificates: Iterable[Certificate]) -> str:

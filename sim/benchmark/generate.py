@@ -1,8 +1,8 @@
-"""Generates the benchmark: 359 tasks that the expert has solved on every robot, with budgets from its plans.
+"""Generates the benchmark: 359 tasks that the expert has solved on every robot, with time limits from its plans.
 
     python -m sim benchmark do=generate    # writes benchmark.jsonl and certificates.jsonl
     python -m sim benchmark do=check       # rebuilds every task from its seed, solves it again, compares bytes
-    python -m sim benchmark do=check_fast  # the same without solving: budgets are taken as they are
+    python -m sim benchmark do=check_fast  # the same without solving: time limits are taken as they are
     python -m sim benchmark do=table       # the certificates per family and robot, as Markdown
 
 A slot is a family in a room. Its seeds are tried in order, and those tasks are kept whose certificates say what their category
@@ -231,14 +231,14 @@ def rebuild(task: Task, solve: bool) -> tuple[Task, tuple[Certificate, ...]]:
 
     Args:
         task: a task of the benchmark.
-        solve: whether the budget comes from the expert again, or is taken over.
+        solve: whether the time limit comes from the expert again, or is taken over.
 
     Raises:
         Refusal: when the expert does not solve it any more as its category says.
     """
     fresh = sample_task(task.seed, task.room, task.family, "benchmark")
     if not solve:
-        return replace(fresh, step_budget=task.step_budget), ()
+        return replace(fresh, time_limit=task.time_limit), ()
     try:
         return certified(fresh)
     except Refusal as refusal:

@@ -154,7 +154,7 @@ def run_dagger_episode(
     while not session.finished:
         target = expert.next_step()
         step, origin = target, "expert"
-        if rng.random() >= config.noise and session.stats.charged < task.step_budget - _FINISH:
+        if rng.random() >= config.noise and session.stats.charged < task.time_limit - _FINISH:
             proposed = accepted(student(observation), observation.history[-1] if observation.history else None)
             if proposed is not None:
                 step, origin = proposed, "student"
@@ -178,9 +178,10 @@ def _start(
     robot = config.robots[index % len(config.robots)]
     room = config.rooms[(index // len(config.robots)) % len(config.rooms)]
     task = sample_task(TRAIN_SEEDS.start + config.seed * _SEEDS_PER_COLLECTION + index, room, robots=(robot,))
-    task = replace(task, step_budget=task.step_budget + extra_steps)
+    task = replace(task, time_limit=task.time_limit + extra_steps)
     difficulty = "medium" if rng.random() < config.medium_share else "easy"
     session = sessions.setdefault((robot, difficulty), Session(robot, difficulty, config.image_size))
+    session.step_limit = task.time_limit  # what is learnt from is in time
     return robot, task, session, session.reset(task, seed=task.seed)
 
 
@@ -250,7 +251,7 @@ def _row(
         "robot": robot,
         "room": task.room,
         "step": observation.step,
-        "step_budget": observation.step_budget,
+        "time_limit": observation.time_limit,
         "instruction": observation.instruction,
         "image": encode_png(observation.image),
         "intrinsics": observation.camera.intrinsics.ravel().tolist(),

@@ -163,7 +163,7 @@ class _Episode:
             "instruction": instruction,
             "robot": robot,
             "category": family_of(draft.family).category,
-            "step_budget": self._budget,
+            "time_limit": self._budget,
             "named": list(draft.focus.values()),
         }
 

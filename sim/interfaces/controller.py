@@ -347,7 +347,7 @@ class Controller:
         assert view.depth is not None and view.segmentation is not None
         failed = [outcome for outcome in outcomes if not outcome.success]
         metadata = world_metadata(session.world)
-        visible = set(session.world.cameras.visible_objects(view.segmentation))
+        visible = set(session.world.cameras.visible_objects(self._shape[1] / self._shape[0]))
         for entry in metadata["objects"]:
             entry["visible"] = entry["objectId"] in visible
             entry["obstructed"] = not entry["visible"]

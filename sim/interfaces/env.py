@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from data.interface.bodies import DEFAULT_ROBOT, KEY_BODIES
+from data.interface.episode import STEP_LIMIT
 from data.interface.observation import Observation
 from data.interface.steps import ActionError, PlanStep
 from data.motion import N_FEATURES
@@ -38,6 +39,7 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
         image_size: side of the picture, pixels.
         render_mode: None, or `rgb_array` for `render`.
         contingency: name of the outcome distributions.
+        step_limit: steps after which an episode is truncated; `info["in_time"]` tells the task's own time limit.
 
     Observation space: `image` (H, W, 3) uint8, `motion` (64, F) float32, `joints` (J,) float32, `key_bodies` (K, 3) float32.
     """
@@ -47,12 +49,13 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
     def __init__(
         self, robot: str = DEFAULT_ROBOT, tasks: Sequence[TaskLike] = (), difficulty: str = "easy", image_size: int = 112,
         render_mode: str | None = None, contingency: str = "default",
+        step_limit: int = STEP_LIMIT,
     ) -> None:  # fmt: skip
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}; allowed: rgb_array")
         self.render_mode = render_mode
-        self._session = Session(robot, difficulty, image_size, contingency)
-        self._tasks: tuple[TaskLike, ...] = tuple(tasks) or (FreePlay("kitchen_1", step_budget=50),)
+        self._session = Session(robot, difficulty, image_size, contingency, step_limit=step_limit)
+        self._tasks: tuple[TaskLike, ...] = tuple(tasks) or (FreePlay("kitchen_1"),)
         self._last: Observation | None = None
         self._invalid = 0
         joints = len(self._session.robot.joints)
@@ -100,7 +103,7 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
         goals = self._session.goal_status()
         reward = float(np.mean(goals)) if goals else 0.0
         done = self._session.succeeded or self._session.ended
-        truncated = not done and self._session.stats.charged + self._invalid >= self._session.task.step_budget
+        truncated = not done and self._session.stats.charged + self._invalid >= self._session.step_limit
         return self._vector(self._last), reward, done, truncated, self._info(error)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]  # one render mode, one return type
@@ -129,4 +132,5 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
             "feedback": self._last.history[-1].feedback if self._last.history else "",
             "invalid_action": error,
             "goals": self._session.goal_status(),
+            "in_time": self._session.stats.charged + self._invalid <= self._session.task.time_limit,
         }

@@ -37,6 +37,7 @@ __all__ = [
     "HELD_DOOR_BITS",
     "LIMB_BIT",
     "MOVABLE_BITS",
+    "PHYSICS",
     "PUDDLES",
     "STATIC_BITS",
     "TIMESTEP_S",
@@ -48,6 +49,10 @@ __all__ = [
 ]
 
 TIMESTEP_S: Final = 0.005
+#: Version of the physics, raised with each change after which the same plan may end otherwise (models, contacts, solver,
+#: motions of skills). Certificates, runs and tables say with which one they were made. 1: MuJoCo chooses sparse or dense Jacobians;
+#: 2: dense ones.
+PHYSICS: Final = 2
 BASE_JOINTS: Final = ("base_x", "base_y", "base_z", "base_yaw", "base_pitch")
 STATIC_BITS: Final = (1, 0)
 MOVABLE_BITS: Final = (2, 23)
@@ -140,6 +145,8 @@ def build_spec(key: SceneKey) -> mujoco.MjSpec:
     option.timestep = TIMESTEP_S
     option.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     option.cone = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
+    # MuJoCo 4.0.0 builds a wrong Newton Hessian from sparse Jacobians (google-deepmind/mujoco #3767); dense costs the same here
+    option.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
     option.iterations = 30
     option.ls_iterations = 10
     option.impratio = 3.0

@@ -13,13 +13,10 @@ from numpy.typing import NDArray
 from data.interface.observation import Camera, HistoryItem, Observation, Proprioception
 from data.motion import encode_frames, world_to_heading
 from sim.world.recorder import FRAME_DT_S
-from sim.world.rendering import camera_intrinsics, camera_pose
+from sim.world.rendering import VISIBILITY_SIZE, camera_intrinsics, camera_pose
 from sim.world.world import World
 
 __all__ = ["head_camera", "observe", "proprioception", "visible_ids"]
-
-#: Side of the segmentation that decides what is visible when no picture is wanted, pixels.
-_PROBE_SIZE = 112
 
 
 def visible_ids(visible: Iterable[str], names: Iterable[str]) -> tuple[str, ...]:
@@ -58,37 +55,36 @@ def observe(
     known: Sequence[str],
     history: Sequence[HistoryItem],
     step: int,
-    step_budget: int,
+    time_limit: int,
+    step_limit: int,
 ) -> Observation:
     """Builds an observation.
 
     Args:
         world: the running scene.
         instruction: the task in words.
-        image_size: side of the picture, pixels; 0 gives a picture without pixels and only tells what is visible.
+        image_size: side of the picture, pixels; 0 gives a picture without pixels. What is visible does not depend on it.
         known: ids known before this look; what is visible now is added.
         history: earlier steps.
         step: index of the coming step.
-        step_budget: number of steps allowed.
+        time_limit: steps within which the task is done in time.
+        step_limit: steps after which the episode ends.
     """
-    size = image_size or _PROBE_SIZE
     image: NDArray[np.uint8] = np.zeros((0, 0, 3), dtype=np.uint8)
     if image_size:
-        view = world.cameras.render("head", size, size, segmentation=True)
-        image, labels = view.rgb, view.segmentation
-    else:
-        labels = world.cameras.labels("head", size, size)
-    visible = visible_ids(world.cameras.visible_objects(labels), world.objects)
+        image = world.cameras.render("head", image_size, image_size).rgb
+    visible = visible_ids(world.cameras.visible_objects(), world.objects)
     assert world.robot is not None
     return Observation(
         instruction=instruction,
         robot=world.robot.name,
         image=image,
-        camera=head_camera(world, size),
+        camera=head_camera(world, image_size or VISIBILITY_SIZE),
         visible_objects=visible,
         known_objects=visible_ids((*known, *visible), world.objects),
         proprioception=proprioception(world),
         history=tuple(history),
         step=step,
-        step_budget=step_budget,
+        time_limit=time_limit,
+        step_limit=step_limit,
     )

@@ -20,6 +20,7 @@ import numpy as np
 from data.interface.actions import ActionKind
 from data.interface.bodies import Arm
 from data.interface.effects import PutDown
+from data.interface.episode import STEP_LIMIT
 from data.interface.feedback import ActionOutcome, Feedback
 from data.interface.observation import HistoryItem, Observation
 from data.interface.steps import Action, PlanStep
@@ -77,7 +78,7 @@ class TaskLike(Protocol):
     @property
     def goals(self) -> Sequence[GoalLike]: ...
     @property
-    def step_budget(self) -> int: ...
+    def time_limit(self) -> int: ...
     @property
     def seed(self) -> int: ...
 
@@ -88,7 +89,7 @@ class FreePlay:
 
     Attributes:
         room: room name.
-        instruction, start, placements, states, goals, step_budget, seed: as in `TaskLike`.
+        instruction, start, placements, states, goals, time_limit, seed: as in `TaskLike`.
     """
 
     room: str
@@ -97,7 +98,7 @@ class FreePlay:
     placements: Sequence[Placement] | None = None
     states: Mapping[str, Mapping[str, bool | float | str]] = field(default_factory=dict)
     goals: tuple[GoalLike, ...] = ()
-    step_budget: int = 1_000_000
+    time_limit: int = STEP_LIMIT
     seed: int = 0
 
 
@@ -121,7 +122,7 @@ class SessionStats:
 
     @property
     def charged(self) -> int:
-        """Steps that count towards the budget: it bounds what is planned, not the luck, so struck ones do not."""
+        """Steps that count towards the limits: these bound what is planned, not the luck, so struck ones do not."""
         return self.steps - self.struck
 
     @property
@@ -149,9 +150,11 @@ class Session:
         difficulty: easy, medium, hard or natural.
         image_size: side of the planner's picture, pixels; 0 draws none.
         contingency: name of the outcome distributions in `configs/contingency`.
+        step_limit: steps after which an episode is `finished`.
         all_known: whether actions may name any object, seen or not; not how planners are evaluated.
 
     Attributes:
+        step_limit: see above.
         world, body, task, stats: of the running episode; only after `reset`.
         watchers: called with the world and the text of the running step after every control tick; they must change nothing.
     """
@@ -167,10 +170,12 @@ class Session:
         image_size: int = 112,
         contingency: str = "default",
         *,
+        step_limit: int = STEP_LIMIT,
         all_known: bool = False,
     ) -> None:
         self.robot = load_robot(robot)
         self._all_known = all_known
+        self.step_limit = step_limit
         self.image_size = image_size
         self._config = load_contingency(contingency)
         self._contingency = Contingency(self._config, difficulty, 0)
@@ -336,7 +341,8 @@ class Session:
             self.known_objects,
             self._history,
             self.stats.charged,
-            self.task.step_budget,
+            self.task.time_limit,
+            self.step_limit,
         )
         self._seen.update(seen.visible_objects)
         return seen
@@ -364,8 +370,8 @@ class Session:
 
     @property
     def finished(self) -> bool:
-        """Whether the episode is over: Done, all goals hold, or the step budget is used up."""
-        return self._ended or self.stats.charged >= self.task.step_budget or self.succeeded
+        """Whether the episode is over: Done, all goals hold, or the step limit is reached."""
+        return self._ended or self.stats.charged >= self.step_limit or self.succeeded
 
     @property
     def history(self) -> tuple[HistoryItem, ...]:

@@ -1,6 +1,6 @@
 """Drafts: what a task puts into a room and asks for, before positions are settled.
 
-A draft says which objects stand on what and which predicates must hold; positions, start poses and step budgets come later (see
+A draft says which objects stand on what and which predicates must hold; positions, start poses and time limits come later (see
 `sim.tasks.sample`). The families that fill drafts are in `sim.tasks.families`. Benchmark and training tasks are drawn by the
 same functions, so they differ in draws only, never in kind. Paper: the DualTHOR task suite.
 """

@@ -1,6 +1,6 @@
 """Task families: what each one puts into a room and asks for.
 
-Categories follow the paper. `single`: one arm is enough. `optional`: one arm can, two are faster, so that the step budget is
+Categories follow the paper. `single`: one arm is enough. `optional`: one arm can, two are faster, so that the time limit is
 one that only two arms keep. `essential`: one arm cannot: because an object takes two hands, because several things have to be
 in the hands at once, because a door falls shut that nothing holds open, or because food rolls away from under the knife. Most
 families of two arms are compositions of single-arm ones; `store_ajar`, `fetch_ajar`, `slice_steady`, `clean_steady` and

@@ -1,4 +1,4 @@
-"""Turns drafts into tasks: positions of objects, the robot's start, wording, budget; and samples training tasks without end.
+"""Turns drafts into tasks: positions of objects, the robot's start, wording, time limit; samples training tasks without end.
 
 A training task is a function of its seed, its room and nothing else. Benchmark tasks come from the same code with other seeds:
 `TRAIN_SEEDS` and `BENCHMARK_SEEDS` do not meet, and every draw is keyed by the seed and the split, so no training task
@@ -196,7 +196,7 @@ def sample_task(
 def settle(
     draft: Draft, task_id: str, seed: int, source: str, rng: np.random.Generator, robots: Sequence[str] = PAPER_ROBOTS
 ) -> Task:
-    """Gives a draft positions, a start, words and a budget.
+    """Gives a draft positions, a start, words and a time limit.
 
     Raises:
         WorldError: when the objects do not fit, or one of the robots cannot reach what it has to touch from anywhere.
@@ -240,7 +240,7 @@ def settle(
         placements=placements,
         states=draft.states,
         goals=tuple(draft.goals),
-        step_budget=int(np.ceil(1.5 * family.steps)) + 2,
+        time_limit=int(np.ceil(1.5 * family.steps)) + 2,
         split="train" if source == "train" else _novelty(draft),
         seed=seed,
     )

@@ -1,4 +1,4 @@
-"""What a task is: the room, the objects put into it, the robot's start, the instruction, the goal and the step budget.
+"""What a task is: the room, the objects put into it, the robot's start, the instruction, the goal and the time limit.
 
 Tasks are plain data: one JSON object per line in `sim/tasks/benchmark.jsonl`, read back through strict validation. Paper: the
 DualTHOR task suite with its categories (single-arm, dual-arm optional, dual-arm essential).
@@ -15,12 +15,12 @@ from typing import Any, Final, Literal
 
 from configs.validate import build
 from data.files import write_text
+from data.interface.episode import STEP_LIMIT
 from sim.tasks.predicates import Predicate
 
 __all__ = [
     "BENCHMARK_PATH",
     "CATEGORIES",
-    "MAX_STEPS",
     "Placement",
     "Start",
     "Task",
@@ -33,7 +33,6 @@ __all__ = [
 
 BENCHMARK_PATH: Final = Path(__file__).parent / "benchmark.jsonl"
 CATEGORIES: Final = ("single", "optional", "essential")
-MAX_STEPS: Final = 50
 
 _OBJECT_ID = re.compile(r"^[A-Za-z][A-Za-z0-9]*_[1-9][0-9]*$")
 
@@ -99,13 +98,13 @@ class Task:
         placements: movable objects; a carrier stands before what it carries.
         states: start states of the room's own objects by id, for example `{"Fridge_1": {"isOpen": true}}`.
         goals: predicates that must all hold.
-        step_budget: plan steps allowed, 1..50, the same for every robot.
+        time_limit: plan steps within which it is done in time, 1..50, the same for every robot. An episode may go on after it.
         split: `train`; of the benchmark's tasks `seen`, or `unseen` when the room or an object that the task names occurs in no
             training task.
         seed: seed the task was drawn with, also the world's seed.
 
     Raises:
-        TaskError: on duplicate ids, no goals, no instruction, or a budget out of range.
+        TaskError: on duplicate ids, no goals, no instruction, or a time limit out of range.
     """
 
     id: str
@@ -116,7 +115,7 @@ class Task:
     start: Start
     placements: tuple[Placement, ...]
     goals: tuple[Predicate, ...]
-    step_budget: int
+    time_limit: int
     split: Literal["seen", "unseen", "train"]
     seed: int
     paraphrases: tuple[str, ...] = ()
@@ -131,8 +130,8 @@ class Task:
             raise TaskError(f"{self.id}: a task needs at least one goal, got {self.goals!r}")
         if not self.instruction.strip():
             raise TaskError(f"{self.id}: empty instruction {self.instruction!r}")
-        if not 1 <= self.step_budget <= MAX_STEPS:
-            raise TaskError(f"{self.id}: step budget {self.step_budget} outside 1..{MAX_STEPS}")
+        if not 1 <= self.time_limit <= STEP_LIMIT:
+            raise TaskError(f"{self.id}: time limit {self.time_limit} outside 1..{STEP_LIMIT}")
 
     def to_json(self) -> dict[str, Any]:
         """Plain form, the inverse of `from_json`."""
@@ -162,7 +161,7 @@ class Task:
             ],
             "states": {object_id: dict(state) for object_id, state in self.states.items()},
             "goals": [goal.to_json() for goal in self.goals],
-            "step_budget": self.step_budget,
+            "time_limit": self.time_limit,
             "split": self.split,
             "seed": self.seed,
         }

@@ -22,10 +22,23 @@ from sim.world.poses import ObjectPoses
 from sim.world.scene_state import SceneState
 from sim.world.servos import Servos
 
-__all__ = ["CAMERAS", "MAX_SIZE", "Cameras", "Renderer", "RenderingError", "View", "camera_intrinsics", "camera_pose"]
+__all__ = [
+    "CAMERAS",
+    "MAX_SIZE",
+    "VISIBILITY_SIZE",
+    "Cameras",
+    "Renderer",
+    "RenderingError",
+    "View",
+    "camera_intrinsics",
+    "camera_pose",
+]
 
 CAMERAS: Final = ("head", "front", "left", "right", "behind", "top", "overview", "plan")
 MAX_SIZE: Final = 1280
+#: Height of the segmentation that decides what is visible, pixels, and the fewest pixels that an object shows.
+VISIBILITY_SIZE: Final = 112
+_LEAST_PIXELS: Final = 6
 _MAX_GEOMS: Final = 1500
 #: A camera of the room that stands in for one that is put somewhere for a picture.
 _FREE: Final = "overview"
@@ -253,22 +266,19 @@ class Cameras:
         """(H, W) segmentation of a camera as in `View`, for less than half of what a picture with it costs."""
         return self._renderer(height, width).labels(camera)
 
-    def visible_objects(
-        self, segmentation: NDArray[np.int32] | None = None, *, min_pixels: int = 6, range_m: float = 8.0
-    ) -> dict[str, int]:
-        """Objects in the head camera's view and the number of pixels each covers.
+    def visible_objects(self, aspect: float = 1.0, *, range_m: float = 8.0) -> dict[str, int]:
+        """Objects in the head camera's view and the number of pixels each covers, at least `_LEAST_PIXELS`.
+
+        They are counted at one size, so that what is visible does not depend on the size of anybody's picture.
 
         Args:
-            segmentation: (H, W) labels of a `View`; None draws 112 x 112.
-            min_pixels: fewest pixels that count, for an image of 112 x 112; scaled with the image's area.
+            aspect: width of the view over its height.
             range_m: farthest horizontal distance from the base.
         """
-        if segmentation is None:
-            segmentation = self.labels()
-        least = max(1.0, min_pixels * segmentation.size / 112**2)
+        segmentation = self.labels("head", VISIBILITY_SIZE, round(aspect * VISIBILITY_SIZE))
         names = list(self._scene.objects)
         labels, counts = np.unique(segmentation[segmentation >= 0], return_counts=True)
-        found = {names[int(label)]: int(count) for label, count in zip(labels, counts, strict=True) if count >= least}
+        found = {names[int(i)]: int(count) for i, count in zip(labels, counts, strict=True) if count >= _LEAST_PIXELS}
         return {name: n for name, n in found.items() if self._servos.distance_to(self._poses.bounds(name)) <= range_m}
 
     def close(self) -> None:

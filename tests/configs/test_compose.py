@@ -75,7 +75,7 @@ def test_every_yaml_composes(path: Path) -> None:
             "planner.image_size=500",
             r"kind 'mllm' with image_size 500; allowed: 112, others with random, scripted, expert",
         ),
-        ("eval", "planner=random planner.image_size=0", r"image_size 0 outside \[16, 2048\]"),
+        ("eval", "planner=random planner.image_size=8", r"image_size 8 outside \[16, 2048\]"),
         ("eval", "planner=random cost_cap_usd=1", r"cost_cap_usd 1\.0 with planner kind 'random', which asks no backend"),
         (
             "eval",

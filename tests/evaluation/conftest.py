@@ -18,10 +18,11 @@ from sim.tasks.task import Placement, Start, Task
 
 
 class FakeSession:
-    """Pick works near the mug, but for the first `unlucky` times; the goal is that it is held. `broken` raises at that step."""
+    """Pick works near the mug, but for the first `unlucky` times; the goal is that it is held. `broken` raises at that step;
+    `drift` is how far each step takes it."""
 
-    def __init__(self, robot: str = "h1", broken: int | None = None, unlucky: int = 0) -> None:
-        self.robot, self.broken, self.unlucky = robot, broken, unlucky
+    def __init__(self, robot: str = "h1", broken: int | None = None, unlucky: int = 0, drift: float = 0.0) -> None:
+        self.robot, self.broken, self.unlucky, self.drift = robot, broken, unlucky, drift
         self.near = self.low = self.held = False
         self.count = 0
 
@@ -67,6 +68,9 @@ class FakeSession:
     def stats(self) -> Stats:
         return Stats(1.0 * self.count, 1.5 * self.count, 0.25)
 
+    def stance(self) -> tuple[float, float, float, float]:
+        return 1.0 * self.near + self.drift * self.count, 0.0, 0.0, 1.0 - 0.1 * self.low
+
     def relations(self) -> dict[str, list[str]]:
         return {"held": ["Mug_1"] if self.held else []}
 
@@ -103,7 +107,7 @@ def make_task(name: str = "a", category: str = "single", budget: int = 6, split:
         start=Start(0.0, 0.0, 0.0, {"h1": 1.0}),
         placements=(Placement("Mug_1", "Mug", "Table_1"),),
         goals=(Predicate("held", "Mug_1"),),
-        step_budget=budget,
+        time_limit=budget,
         split=split,  # type: ignore[arg-type]
         seed=1,
     )

@@ -81,6 +81,7 @@ def cfg(tmp_path: Path, task) -> EvalConfig:
         PlannerConfig("gpt4o", "plain", "GPT-4o"),
         RobotConfig("h1"),
         workers=0,
+        steps="task",
         tasks=str(tmp_path / "tasks.jsonl"),
         output=str(tmp_path / "out"),
         backend=backend,
@@ -171,7 +172,7 @@ def test_what_was_run_and_what_it_cost_is_in_the_metadata(cfg, session) -> None:
     assert stored["backend"]["name"] == "script"
     assert stored["reflection"] == "on"
     assert run(cfg, session, backend=script(cfg, "flaky")).folder != result.folder
-    assert result.folder.name.startswith("gpt4o-script-h1-easy-tasks-")
+    assert result.folder.name.startswith("gpt4o-script-h1-easy-steps_task-tasks-")
     told = dataclasses.replace(cfg.planner, body=True, horizon=2, reflection="off")
     assert "-easy-no_reflection-body-horizon2-tasks-" in run_folder(dataclasses.replace(cfg, planner=told), "").name
 

@@ -9,7 +9,7 @@ import pytest
 
 from data.interface.episode import Outcome
 from data.interface.failures import FailureCategory
-from proprio_mllm.evaluation.episode import run_episode
+from proprio_mllm.evaluation.episode import Limits, run_episode
 from proprio_mllm.evaluation.ledger import Ledger, read_ledger
 from proprio_mllm.planners.protocol import Usage
 
@@ -17,7 +17,7 @@ SOLVED = ("GoTo(Mug_1)", "MoveDown(0.2)", "Pick(left, Mug_1)")
 
 
 def play(session, planner, fields, budget=6, **kwargs):
-    return run_episode(lambda: session, planner, fields, "pick up the mug", budget, 5, **kwargs)
+    return run_episode(lambda: session, planner, fields, "pick up the mug", Limits(budget, budget), 5, **kwargs)
 
 
 def test_success_ends_the_episode_and_is_counted(session, scripted, fields) -> None:
@@ -36,7 +36,7 @@ def test_the_runner_owns_history_step_and_budget(session, scripted, fields) -> N
     planner = scripted("GoTo(Mug_1)", "gibberish", "Pick(left, Mug_1)", "MoveDown(0.2)")
     play(session(), planner, fields, budget=5)
     assert [o.step for o in planner.seen] == [0, 1, 2, 3, 4]
-    assert {o.step_budget for o in planner.seen} == {5}
+    assert {o.time_limit for o in planner.seen} == {5}
     assert [item.feedback for item in planner.seen[4].history] == [
         "GoTo(Mug_1) ok",
         "gibberish InvalidOutput",
@@ -61,6 +61,34 @@ def test_budget_and_category(session, scripted, fields) -> None:
     assert record.failure is FailureCategory.NAVIGATION
     assert record.budget_exhausted
     assert record.steps == 4
+
+
+def test_a_success_after_the_time_limit_is_late(session, scripted, fields) -> None:
+    late = (*["RotateLeft(5)"] * 2, *SOLVED)
+    found = [run_episode(session, scripted(*late), fields, "x", Limits(time), 5) for time in (4, 5)]
+    assert [(one.outcome, one.in_time, one.steps) for one in found] == [(Outcome.SUCCESS, False, 5), (Outcome.SUCCESS, True, 5)]
+    planner = scripted(*late)
+    run_episode(session, planner, fields, "x", Limits(4), 5)
+    assert {(seen.time_limit, seen.step_limit) for seen in planner.seen} == {(4, 50)}
+
+
+def test_what_only_repeats_itself_is_ended_as_stuck(session, scripted, fields) -> None:
+    def ended(*steps: str, unlucky: int = 0):
+        return run_episode(lambda: session(unlucky=unlucky), scripted(*steps), fields, "x", Limits(6, 50, 8), 5)
+
+    refused = ended(*["Pick(left, Mug_1)"] * 60)
+    assert (refused.outcome, refused.stuck, refused.budget_exhausted, refused.steps) == (Outcome.FAILURE, True, False, 8)
+    assert refused.failure is FailureCategory.NAVIGATION
+    turns = ended(*["RotateLeft(45)", "RotateRight(45)"] * 30)
+    assert (turns.stuck, turns.steps) == (True, 8)
+    assert ended(*["gibberish"] * 60).steps == 8
+    varied = ended(*["RotateLeft(45)", "RotateRight(45)", "RotateLeft(5)"] * 20)
+    assert (varied.stuck, varied.budget_exhausted, varied.steps) == (False, True, 50)
+    # who moves, or has bad luck that may change, is not stuck
+    walks = run_episode(lambda: session(drift=0.1), scripted(*["MoveAhead(0.1)"] * 60), fields, "x", Limits(6, 50, 8), 5)
+    assert walks.budget_exhausted
+    unlucky = ended("GoTo(Mug_1)", "MoveDown(0.2)", *["Pick(left, Mug_1)"] * 60, unlucky=20)
+    assert unlucky.outcome is Outcome.SUCCESS
 
 
 def test_steps_that_bad_luck_spoils_are_not_charged(session, scripted, fields) -> None:
@@ -156,7 +184,7 @@ def test_an_error_while_opening_is_recorded_too(scripted, fields) -> None:
     def broken():
         raise OSError("no display")
 
-    record = run_episode(broken, scripted(), fields, "x", 3, 0)
+    record = run_episode(broken, scripted(), fields, "x", Limits(3), 0)
     assert record.outcome is Outcome.INFRASTRUCTURE_ERROR
     assert "no display" in record.message
 

@@ -9,14 +9,14 @@ import pytest
 
 from data.interface.episode import Outcome
 from data.interface.failures import FailureCategory
-from proprio_mllm.evaluation.episode import run_episode
+from proprio_mllm.evaluation.episode import Limits, run_episode
 from proprio_mllm.evaluation.ledger import Ledger, LedgerError, key_of, read_ledger, scored
 from proprio_mllm.evaluation.seeds import episode_seed, stream
 
 
 @pytest.fixture
 def record(session, scripted, fields):
-    return run_episode(session, scripted("Pick(left, Mug_1)", "ünlesbar"), fields, "pick up the mug", 4, 1)
+    return run_episode(session, scripted("Pick(left, Mug_1)", "ünlesbar"), fields, "pick up the mug", Limits(4, 4), 1)
 
 
 def test_round_trip(tmp_path, record) -> None:

@@ -72,7 +72,7 @@ def ray() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def cfg(own: PlannerConfig, tmp_path_factory: pytest.TempPathFactory) -> EvalConfig:
     folder = tmp_path_factory.mktemp("runs")
-    write_tasks([dataclasses.replace(task, step_budget=1) for task in load_benchmark()[:3]], folder / "tasks.jsonl")
+    write_tasks([dataclasses.replace(task, time_limit=1) for task in load_benchmark()[:3]], folder / "tasks.jsonl")
     return EvalConfig(own, RobotConfig("h1"), workers=0, tasks=str(folder / "tasks.jsonl"), output=str(folder / "serial"))
 
 

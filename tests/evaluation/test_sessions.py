@@ -29,7 +29,7 @@ TASK = Task(
     start=Start(0.0, 0.0, 0.0, {"h1": 0.95, "x1": 0.7}),
     placements=(Placement("Mug_1", "Mug", "CoffeeTable_1"),),
     goals=(Predicate("held", "Mug_1"),),
-    step_budget=3,
+    time_limit=3,
     split="seen",
     seed=4,
 )
@@ -42,6 +42,7 @@ def cfg(tmp_path: Path) -> EvalConfig:
         planner=PlannerConfig("random", "random", "Random"),
         robot=RobotConfig("h1"),
         workers=0,
+        steps="task",
         tasks=str(tmp_path / "tasks.jsonl"),
         output=str(tmp_path / "a"),
     )

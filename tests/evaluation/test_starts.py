@@ -65,7 +65,7 @@ def test_random_start_needs_a_robot_and_room() -> None:
 
 def test_planners_start_an_episode_from_the_same_place(tmp_path) -> None:
     """Two planners that do nothing but look: what they see at the first step is the same, and differs between trials."""
-    task = dataclasses.replace(TASK, step_budget=1)
+    task = dataclasses.replace(TASK, time_limit=1)
     write_tasks([task], tmp_path / "tasks.jsonl")
     first = _images(tmp_path, "one", task)
     assert len(first) == 2

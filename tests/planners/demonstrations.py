@@ -104,7 +104,7 @@ def rows_of(demo: Demo, split: str = "train") -> list[dict[str, Any]]:
                 "robot": demo.robot,
                 "room": demo.room,
                 "step": number,
-                "step_budget": 12,
+                "time_limit": 12,
                 "instruction": demo.instruction,
                 "image": encode_png(image),
                 "intrinsics": np.eye(3).ravel(),

@@ -17,7 +17,7 @@ from data.interface.feedback import Feedback
 from data.interface.observation import Observation
 from data.interface.steps import PlanStep
 from proprio_mllm.backends.protocol import ChatRequest
-from proprio_mllm.evaluation.episode import EpisodeKeyFields, GoalReport, RunnableSession, Stats, run_episode
+from proprio_mllm.evaluation.episode import EpisodeKeyFields, GoalReport, Limits, RunnableSession, Stats, run_episode
 from proprio_mllm.evaluation.privileged import ExpertPlanner
 from proprio_mllm.evaluation.sessions import SimSession
 from proprio_mllm.planners.chat.dag_plan.planner import DagPlanner
@@ -42,7 +42,7 @@ TASK = Task(
     start=Start(0.0, 0.0, 0.0, {"h1": 0.95, "x1": 0.58}),
     placements=(Placement("Mug_1", "Mug", "CounterTop_1"), Placement("Apple_1", "Apple", "DiningTable_1")),
     goals=(Predicate("held", "Mug_1"),),
-    step_budget=5,
+    time_limit=5,
     split="seen",
     seed=4,
 )
@@ -70,6 +70,9 @@ class Kept:
 
     def stats(self) -> Stats:
         return self.inner.stats()
+
+    def stance(self) -> tuple[float, float, float, float]:
+        return self.inner.stance()
 
     def relations(self) -> Mapping[str, Sequence[str]]:
         return {}
@@ -105,7 +108,7 @@ class Scrambled(Kept):
 def episode(planner: Planner, session: RunnableSession) -> list[str]:
     """Steps that the planner took."""
     fields = EpisodeKeyFields("p", "h1", "mug", "single", "easy", 0, 0, "c")
-    record = run_episode(lambda: session, planner, fields, TASK.instruction, TASK.step_budget, 3)
+    record = run_episode(lambda: session, planner, fields, TASK.instruction, Limits.of(TASK.time_limit, "task"), 3)
     assert not record.message, record.message
     return [str(entry["step"]) for entry in record.trace]
 
@@ -155,7 +158,7 @@ def test_calls_do_not_depend_on_what_is_not_shown(kind: str, sessions: tuple[Ses
     first = episode(make(scripts), kept)
     second = episode(make(scripts), Scrambled(sessions[1], kept.shown))
     assert first == second
-    assert len(first) == TASK.step_budget or first[-1] == "Done()"
+    assert len(first) == TASK.time_limit or first[-1] == "Done()"
     if scripts:
         assert scripts[0].requests == scripts[1].requests
         assert scripts[0].requests
@@ -167,7 +170,7 @@ def test_a_planner_that_looks_is_caught(sessions: tuple[Session, Session]) -> No
     expert.attach(sessions[0])
     first = episode(expert, kept)
     expert.attach(sessions[1])
-    scrambled = Scrambled(sessions[1], [*kept.shown, *kept.shown[-1:] * TASK.step_budget])
+    scrambled = Scrambled(sessions[1], [*kept.shown, *kept.shown[-1:] * TASK.time_limit])
     fields = EpisodeKeyFields("p", "h1", "mug", "single", "easy", 0, 0, "c")
-    record = run_episode(lambda: scrambled, expert, fields, TASK.instruction, TASK.step_budget, 3)
+    record = run_episode(lambda: scrambled, expert, fields, TASK.instruction, Limits.of(TASK.time_limit, "task"), 3)
     assert [str(entry["step"]) for entry in record.trace] != first

@@ -48,7 +48,7 @@ def test_it_plans_with_the_parts_of_its_name(name: str, first: Observation) -> N
     planner = MllmPlanner.load(WEIGHTS / name)
     cfg = planner.model.cfg
     assert (cfg.mpe.mode, cfg.cse.enabled, cfg.proprioception) == PARTS[name]
-    planner.reset(TaskInfo(first.instruction, first.robot, first.step_budget), np.random.default_rng(0))
+    planner.reset(TaskInfo(first.instruction, first.robot, first.time_limit), np.random.default_rng(0))
     reply = planner.step(first, None)
     assert reply.step is not None, reply.text
 
@@ -71,7 +71,7 @@ def test_it_says_where_it_comes_from(name: str) -> None:
 def test_the_model_plans_alike_alone_and_in_a_batch(tmp_path: Path) -> None:
     """Rows are not equal to the last bit (sums are rounded in another order); the plans are, over whole episodes."""
     everything = load_benchmark()
-    tasks = [dataclasses.replace(everything[i * len(everything) // 3], step_budget=1 + i) for i in range(3)]
+    tasks = [dataclasses.replace(everything[i * len(everything) // 3], time_limit=1 + i) for i in range(3)]
     write_tasks(tasks, tmp_path / "tasks.jsonl")
     planner = PlannerConfig("proprio", "mllm", "P", str(WEIGHTS / "full"))
     cfg = EvalConfig(planner, RobotConfig("h1"), workers=0, tasks=str(tmp_path / "tasks.jsonl"), output=str(tmp_path / "1"))

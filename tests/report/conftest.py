@@ -62,6 +62,8 @@ def store_run(folder: Path, records: list[EpisodeRecord], **change: object) -> P
         "trials": 1,
         "limit": None,
         "start": "fixed",
+        "steps": 50,
+        "stuck": 8,
         "seed": 0,
         "tasks": "benchmark",
         "weights": None,

@@ -31,7 +31,7 @@ LAMP = Task(
     start=Start(0.0, 0.0, 0.0, {"h1": 0.95, "x1": 0.7}),
     placements=(Placement("Mug_1", "Mug", "CoffeeTable_1"),),
     goals=(Predicate("held", "Mug_1"), Predicate("not", of=(Predicate("open", "Drawer_1"),))),
-    step_budget=6,
+    time_limit=6,
     split="seen",
     seed=4,
 )
@@ -47,7 +47,7 @@ PLANT = Task(
     start=Start(2.6, 0.1, -110.0, {"h1": 0.7, "x1": 0.43}),
     placements=(Placement("HousePlant_1", "HousePlant", "DiningTable_1", (2.29, -0.83)),),
     goals=(Predicate("lifted", "HousePlant_1"), Predicate("not", of=(Predicate("open", "Fridge_1"),))),
-    step_budget=7,
+    time_limit=7,
     split="seen",
     seed=21001,
 )
@@ -104,7 +104,8 @@ def write_run(
             ledger.append(record)
     meta = {
         "version": 1, "planner": "random", "label": "Random", "privileged": False, "robot": robot, "difficulty": "easy",
-        "contingencies": "default", "category": "all", "trials": 1, "limit": None, "start": "fixed", "seed": 0,
+        "contingencies": "default", "category": "all", "trials": 1, "limit": None, "start": "fixed", "steps": 50,
+        "stuck": 8, "seed": 0,
         "tasks": cfg.tasks, "weights": None, "weights_digest": "", "config_hash": "c",
         "command": "python eval.py planner=random",
         "planned": [[record.task, record.category, record.trial, record.config_hash] for record in records],

@@ -81,7 +81,7 @@ def _episode(instruction: str, moments: list[tuple[str, str, list[str]]]) -> lis
     log: list[dict[str, str]] = []
     for step, (target, taken, known) in enumerate(moments):
         if target:
-            row = {"instruction": instruction, "robot": "h1", "category": "single", "step": step, "step_budget": 20}
+            row = {"instruction": instruction, "robot": "h1", "category": "single", "step": step, "time_limit": 20}
             rows.append({**row, "visible": [], "known": known, "history": log[-8:], "named": [], "target": target})
         log.append({"step": taken, "feedback": f"{taken} ok"})
     return rows

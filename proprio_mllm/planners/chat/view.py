@@ -51,7 +51,7 @@ def log_text(history: tuple[HistoryItem, ...], last: int) -> str:
 
 
 def scene_text(observation: Observation, last: int, body: bool) -> str:
-    """Task, budget, names, the log, and with `body` the robot's own state.
+    """Task, limits, names, the log, and with `body` the robot's own state.
 
     Args:
         observation: what is seen.
@@ -62,7 +62,7 @@ def scene_text(observation: Observation, last: int, body: bool) -> str:
     elsewhere = [name for name in observation.known_objects if name not in seen]
     parts = [
         f"Task: {observation.instruction}",
-        f"This is step {observation.step + 1} of at most {observation.step_budget}.",
+        f"This is step {observation.step + 1} of at most {observation.step_limit}; in time are {observation.time_limit}.",
         f"Objects in view: {', '.join(observation.visible_objects) or 'none'}",
         f"Known elsewhere: {', '.join(elsewhere) or 'none'}",
         *([body_text(observation.proprioception)] if body else []),

@@ -36,7 +36,7 @@ def test_calls_do_not_depend_on_what_is_not_shown(kind: type[LlmPlanner | RapPla
     kept = Kept(SimSession(sessions[0], TASK))
     first = episode(kind(scripts[0], options), kept)
     assert first == episode(kind(scripts[1], options), Scrambled(sessions[1], kept.shown))
-    assert len(first) == TASK.step_budget
+    assert len(first) == TASK.time_limit
     assert scripts[0].requests == scripts[1].requests
     assert scripts[0].requests
     for session in sessions:

@@ -37,7 +37,7 @@ def test_the_scene_has_task_budget_names_and_log() -> None:
     history = (HistoryItem("GoTo(Mug_1)", "GoTo(Mug_1) ok"), HistoryItem("Pick(left, Mug_1)", "Pick(left, Mug_1) TooFar"))
     text = scene_text(observation(history), 20, body=False)
     assert "Task: pick up the mug" in text
-    assert "step 3 of at most 9" in text
+    assert "step 3 of at most 50; in time are 9" in text
     assert "Objects in view: Mug_1\nKnown elsewhere: Fridge_1, Table_1" in text
     assert "1. GoTo(Mug_1) ok\n2. Pick(left, Mug_1) TooFar" in text
     assert "pelvis" not in text

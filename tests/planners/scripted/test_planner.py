@@ -12,7 +12,7 @@ from data.interface.bodies import Arm
 from data.interface.effects import Condition
 from data.interface.episode import Outcome
 from data.interface.observation import Camera, HistoryItem, Observation, Proprioception
-from proprio_mllm.evaluation.episode import EpisodeKeyFields, run_episode
+from proprio_mllm.evaluation.episode import EpisodeKeyFields, Limits, run_episode
 from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.protocol import Planner, TaskInfo
 from proprio_mllm.planners.scripted.belief import UNKNOWN, Belief
@@ -239,7 +239,7 @@ def test_an_episode_succeeds(robot: str) -> None:
     def session() -> object:
         return open_session(RobotConfig(robot), "easy", "fixed", task, 0, planner)
 
-    record = run_episode(session, planner, fields, task.instruction, task.step_budget, 0)  # type: ignore[arg-type]
+    record = run_episode(session, planner, fields, task.instruction, Limits(task.time_limit), 0)  # type: ignore[arg-type]
     assert record.outcome is Outcome.SUCCESS, record.message or record.trace
-    assert record.steps <= task.step_budget
+    assert record.steps <= task.time_limit
     assert record.invalid_output == 0

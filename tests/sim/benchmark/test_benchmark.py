@@ -6,7 +6,7 @@ from collections import Counter
 import pytest
 
 from data.interface.bodies import PAPER_ROBOTS
-from sim.benchmark.certificates import budget_of, certificates_text, load_certificates
+from sim.benchmark.certificates import certificates_text, load_certificates, time_limit_of
 from sim.benchmark.composition import COMPOSITION
 from sim.benchmark.generate import Slot, counts, main, moved, named_types, rebuild, slots
 from sim.scene.catalogue import load_catalogue
@@ -64,8 +64,8 @@ def test_certificates_say_what_the_category_promises(task):
     else:
         assert None not in alone
     if task.category == "optional":
-        assert task.step_budget < min(n for n in alone if n is not None), "one arm alone misses the budget"
-    assert max(steps) <= task.step_budget == budget_of(steps, alone if task.category == "optional" else ())
+        assert task.time_limit < min(n for n in alone if n is not None), "one arm alone misses the budget"
+    assert max(steps) <= task.time_limit == time_limit_of(steps, alone if task.category == "optional" else ())
 
 
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.id)
@@ -97,10 +97,10 @@ def test_the_table_has_a_row_per_family_and_robot(capsys):
 
 
 def test_budgets():
-    assert budget_of([3, 4]) == 8
-    assert budget_of([40]) == 50
-    assert budget_of([5, 6], [9, 8]) == 7
-    assert budget_of([5, 6], [30, None]) == 11
+    assert time_limit_of([3, 4]) == 8
+    assert time_limit_of([40]) == 50
+    assert time_limit_of([5, 6], [9, 8]) == 7
+    assert time_limit_of([5, 6], [30, None]) == 11
 
 
 def test_unknown_arguments_are_refused(capsys):

@@ -29,7 +29,7 @@ def play(robot, task, difficulty="easy", seed=0):
 def test_simple_tasks_are_solved_within_their_budget(robot, task):
     session = play(robot, task)
     assert session.succeeded
-    assert session.stats.steps <= task.step_budget
+    assert session.stats.steps <= task.time_limit
 
 
 def test_plans_repeat():
@@ -38,7 +38,7 @@ def test_plans_repeat():
 
 
 def test_the_expert_recovers_from_a_perturbation_and_says_done_afterwards():
-    task = dataclasses.replace(SIMPLE[1], step_budget=15)
+    task = dataclasses.replace(SIMPLE[1], time_limit=15)
     session = Session("x1", "easy", image_size=0)
     session.reset(task, seed=0)
     expert = Expert(session)

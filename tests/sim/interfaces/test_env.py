@@ -12,13 +12,13 @@ from sim.session.session import FreePlay
 
 @pytest.fixture(scope="module")
 def env():
-    made = DualThorEnv("x1", tasks=(FreePlay("living_room_1", step_budget=3),), image_size=56, render_mode="rgb_array")
+    made = DualThorEnv("x1", tasks=(FreePlay("living_room_1"),), image_size=56, render_mode="rgb_array", step_limit=3)
     yield made
     made.close()
 
 
 def test_check_env():
-    made = DualThorEnv("x1", tasks=(FreePlay("living_room_1", step_budget=2),), image_size=56)
+    made = DualThorEnv("x1", tasks=(FreePlay("living_room_1"),), image_size=56, step_limit=2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         check_env(made, skip_render_check=True)
@@ -55,7 +55,7 @@ def test_bad_arguments(env):
 def test_invalid_text_uses_up_the_budget():
     env = DualThorEnv("x1", image_size=56)
     env.reset(seed=0)
-    budget = env.session.task.step_budget
+    budget = env.session.task.time_limit
     ends = [env.step("what?")[3] for _ in range(budget)]
     assert not any(ends[:-1])
     assert ends[-1]

@@ -1,6 +1,6 @@
 """Sessions: observations, statistics, goals, exact snapshots, determinism."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +33,7 @@ TASK = FreePlay(
     start=Start(-1.0, 1.0, 90.0, {"h1": 0.95}),
     placements=(MUG,),
     goals=(Predicate("held", "Mug_1"),),
-    step_budget=8,
+    time_limit=8,
     seed=4,
 )
 
@@ -54,7 +54,7 @@ def test_observation_holds_what_a_planner_may_see(session):
     assert seen.image.shape == (56, 56, 3) and seen.robot == "h1" and seen.instruction == "Bring the mug."
     assert seen.proprioception.motion.shape == (64, 48) and np.isfinite(seen.proprioception.motion).all()
     assert "Mug_1" in seen.visible_objects and "Fridge_1" in seen.known_objects
-    assert seen.history == () and seen.step == 0 and seen.step_budget == 8
+    assert seen.history == () and seen.step == 0 and seen.time_limit == 8
     pose = seen.camera.camera_in_pelvis
     assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
     assert 0.3 < pose[2, 3] < 1.0 and pose[2, 2] < 0.0  # above the pelvis, looking down
@@ -126,8 +126,8 @@ def test_luck_is_keyed_by_the_seed():
 
 
 def test_the_budget_charges_no_step_that_bad_luck_spoils():
-    made = Session("h1", "hard", 0)
-    made.reset(replace(TASK, step_budget=2), 3)
+    made = Session("h1", "hard", 0, step_limit=2)
+    made.reset(TASK, 3)
     steps(made, "GoTo(Mug_1)")
     struck = []
     while not made.finished:

@@ -19,7 +19,7 @@ def make_task(**changes):
         "start": Start(0.5, -1.0, 90.0, {"h1": 0.9, "x1": 0.6}),
         "placements": (Placement("Mug_1", "Mug", "CounterTop_1", (1.0, 2.0), 30.0, {"fillLiquid": 0.5}),),
         "goals": (Predicate("held", "Mug_1"),),
-        "step_budget": 8,
+        "time_limit": 8,
         "split": "train",
         "seed": 3,
         "paraphrases": ("Grab the mug.",),
@@ -53,7 +53,7 @@ def test_repeated_ids_in_a_file_are_named(tmp_path):
         ({"placements": (Placement("Mug_1", "Mug", "A_1"),) * 2}, "Mug_1"),
         ({"goals": ()}, "at least one goal"),
         ({"instruction": " "}, "empty instruction"),
-        ({"step_budget": 51}, "51"),
+        ({"time_limit": 51}, "51"),
     ],
 )
 def test_bad_tasks_are_refused(changes, message):
@@ -74,7 +74,7 @@ def test_bad_object_ids_are_refused():
         ("category", "triple", "triple"),
         ("split", "test", "test"),
         ("colour", "red", "colour"),
-        ("step_budget", "ten", "ten"),
+        ("time_limit", "ten", "ten"),
         ("goals", [{"kind": "near", "object_id": "Mug_1"}], "near"),
     ],
 )

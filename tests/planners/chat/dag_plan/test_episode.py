@@ -6,7 +6,7 @@ import pytest
 
 from configs.schema.robot import RobotConfig
 from data.interface.episode import EpisodeRecord, Outcome
-from proprio_mllm.evaluation.episode import EpisodeKeyFields, run_episode
+from proprio_mllm.evaluation.episode import EpisodeKeyFields, Limits, run_episode
 from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.chat.dag_plan.planner import DagPlanner
 from proprio_mllm.planners.chat.options import ChatOptions
@@ -35,7 +35,7 @@ def episode(task: Task, parallel: bool) -> EpisodeRecord:
     def session() -> object:
         return open_session(RobotConfig("h1"), "easy", "fixed", task, 0, planner)
 
-    return run_episode(session, planner, fields, task.instruction, STEPS, 0)  # type: ignore[arg-type]
+    return run_episode(session, planner, fields, task.instruction, Limits(STEPS, STEPS), 0)  # type: ignore[arg-type]
 
 
 def test_both_arms_need_fewer_steps_and_less_time_in_the_simulator(task: Task) -> None:
@@ -43,7 +43,7 @@ def test_both_arms_need_fewer_steps_and_less_time_in_the_simulator(task: Task) -
     for record in (both, one):
         assert record.outcome is Outcome.SUCCESS, record.message or record.trace
         assert (record.planner_calls, record.invalid_output, record.reflections) == (1, 0, 0)
-    assert both.steps <= task.step_budget < one.steps
+    assert both.steps <= task.time_limit < one.steps
     assert both.makespan_s < one.makespan_s
     assert both.arm_utilisation > one.arm_utilisation
     assert any("&" in str(entry["step"]) for entry in both.trace)

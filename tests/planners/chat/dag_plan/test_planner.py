@@ -44,7 +44,7 @@ class World:
     def seen(self) -> Observation:
         known = tuple(name for name in KNOWN if name not in self.hidden)
         shown = observation(self.history, visible=())
-        return dataclasses.replace(shown, instruction=self.task, known_objects=known, step_budget=40)
+        return dataclasses.replace(shown, instruction=self.task, known_objects=known, time_limit=40)
 
     def act(self, answer: PlannerReply) -> None:
         if answer.step is None:
