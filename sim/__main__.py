@@ -15,7 +15,7 @@ COMMANDS: Final = {
     "video": ("sim.tools.video", "film of an episode that you or the expert plan"),
     "motion": ("sim.tools.motion", "film of a human clip beside the robots that it was retargeted to"),
     "collect": ("sim.collection.collect", "shards to train on: views, demonstrations, planning in words"),
-    "benchmark": ("sim.benchmark.generate", "the 359 tasks: check, generate, or tabulate them"),
+    "benchmark": ("sim.benchmark.commands", "the 359 tasks and their certificates: check, refresh, tabulate, or generate them"),
     "serve": ("sim.interfaces.remote.serve", "the Controller over HTTP"),
 }
 

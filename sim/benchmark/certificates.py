@@ -1,9 +1,10 @@
 """Certificates: what the expert needed for a task on each robot, with both arms and with one.
 
-A certificate holds the plan that succeeds at difficulty easy, its simulated time, path and use of the arms, and what the expert
-could do with one arm disabled: essential tasks then fail with either arm, single-arm tasks still succeed with one of them, and
-optional tasks succeed too, but not within the time limit. The one-armed figures are the expert's, not proven
-optima.
+A certificate states facts: that the expert solves the task at difficulty easy, in how many steps, and in how many with one arm
+disabled. Its plan, simulated time, path and use of the arms are information: their last digits differ between processors. It
+says with which physics (`sim.scene.compiler.PHYSICS`) it was made, and may be older than the present one. With one arm
+essential tasks fail with either arm, single-arm tasks still succeed with one of them, and optional tasks succeed too, but not
+within the time limit. The one-armed figures are the expert's, not proven optima.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 
 from data.interface.bodies import PAPER_ROBOTS, Arm
 from data.interface.episode import STEP_LIMIT
+from sim.scene.compiler import PHYSICS
 from sim.tasks.families import family_of
 from sim.tasks.task import BENCHMARK_PATH, Task
 
@@ -56,6 +58,7 @@ class Certificate:
         path_length_m: length of the base's path.
         arm_utilisation: mean fraction of arm-steps in which an arm acted.
         one_arm_steps: steps with that arm only, None where it does not succeed within 50.
+        physics: version of the physics that it was made with.
     """
 
     task: str
@@ -65,12 +68,19 @@ class Certificate:
     path_length_m: float
     arm_utilisation: float
     one_arm_steps: Mapping[str, int | None] = field(default_factory=dict)
+    physics: int = PHYSICS
+
+    @property
+    def stale(self) -> bool:
+        """Whether the physics has changed since."""
+        return self.physics != PHYSICS
 
     def to_json(self) -> dict[str, Any]:
         """Plain form; simulated quantities are rounded, steps are exact."""
         return {
             "task": self.task,
             "robot": self.robot,
+            "physics": self.physics,
             "steps": len(self.plan),
             "plan": list(self.plan),
             "makespan_s": round(self.makespan_s, 1),
@@ -83,7 +93,7 @@ class Certificate:
     def from_json(record: Mapping[str, Any]) -> Certificate:
         """Reads `to_json` back."""
         values = {key: value for key, value in record.items() if key != "steps"}
-        return Certificate(**{**values, "plan": tuple(values["plan"])})
+        return Certificate(**{"physics": 1, **values, "plan": tuple(values["plan"])})
 
 
 def time_limit_of(steps: Sequence[int], one_arm: Sequence[int | None] = ()) -> int:
@@ -134,8 +144,15 @@ def one_armed_steps(task: Task, certificate: Certificate) -> dict[str, int | Non
     return found
 
 
-def certified(task: Task, robots: Sequence[str] = PAPER_ROBOTS) -> tuple[Task, tuple[Certificate, ...]]:
+def certified(
+    task: Task, old: Mapping[str, Certificate] | None = None, robots: Sequence[str] = PAPER_ROBOTS
+) -> tuple[Task, tuple[Certificate, ...]]:
     """The task with its time limit, and a certificate per robot.
+
+    Args:
+        task: what is solved.
+        old: certificates by robot: one-armed steps are taken from them where the plan is still the same.
+        robots: robots that solve it now; for others the old certificate stands.
 
     Raises:
         Refusal: when some robot fails, needs too long, or does not need, or gain from, its arms as the category says.
@@ -144,11 +161,15 @@ def certified(task: Task, robots: Sequence[str] = PAPER_ROBOTS) -> tuple[Task, t
     proofs: list[Certificate] = []
     steps: list[int] = []
     alone: list[int | None] = []
-    for robot in sorted(robots, reverse=True):  # x1, which fails more often, first
-        proof = certify(task, robot, step_limit=limit)
+    for robot in sorted(PAPER_ROBOTS, reverse=True):  # x1, which fails more often, first
+        before = (old or {}).get(robot)
+        proof = certify(task, robot, step_limit=limit) if robot in robots else before
         if proof is None:
             raise Refusal(f"{robot} does not solve it within {limit} steps")
-        proof = replace(proof, one_arm_steps=one_armed_steps(task, proof))
+        if before is not None and proof.plan == before.plan:
+            proof = replace(proof, one_arm_steps=before.one_arm_steps)
+        else:
+            proof = replace(proof, one_arm_steps=one_armed_steps(task, proof))
         least = min((n for n in proof.one_arm_steps.values() if n is not None), default=None)
         if task.category == "essential" and least is not None:
             raise Refusal(f"{robot} solves it with one arm in {least} steps")
@@ -162,7 +183,7 @@ def certified(task: Task, robots: Sequence[str] = PAPER_ROBOTS) -> tuple[Task, t
     time_limit = time_limit_of(steps, alone if task.category == "optional" else ())
     if time_limit < max(steps):
         raise Refusal(f"two arms take {max(steps)} steps, one arm {min(n for n in alone if n is not None)}")
-    ordered = sorted(proofs, key=lambda proof: robots.index(proof.robot))
+    ordered = sorted(proofs, key=lambda proof: PAPER_ROBOTS.index(proof.robot))
     return replace(task, time_limit=time_limit), tuple(ordered)
 
 
