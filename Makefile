@@ -15,7 +15,7 @@ QUICK := tests/configs tests/data/interface tests/model tests/planners tests/rep
   $(addprefix --ignore=tests/,$(addprefix report/test_,export.py figures.py notebook.py reconstruction.py tokenizer.py video.py) \
   $(addprefix planners/,chat/dag_plan/test_episode.py scripted/test_planner.py test_released.py))
 
-.PHONY: setup eval test test-slow quick check serve motions lock third-party clean
+.PHONY: setup eval test test-slow quick check release-check serve motions lock third-party clean
 
 setup: $(STAMP)
 
@@ -46,6 +46,10 @@ check: $(STAMP)
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 	$(BIN)/python tools/structure.py --check
+
+# What a release needs beyond the tests: tasks come from their seeds, certificates are of the present physics.
+release-check: $(STAMP)
+	$(BIN)/python -m sim benchmark release=true
 
 # The released tiny base model behind OpenAI's chat API on http://127.0.0.1:8377/v1, or another: SERVE_ARGS="weights=... port=...".
 serve: $(STAMP)
