@@ -79,6 +79,11 @@ class Rehearsal:
                     return True
         return False
 
+    def succeeds(self, step: PlanStep) -> bool:
+        """Whether a step taken here and now goes well, bad luck apart: it is acted out and undone."""
+        with self._session.imagining():
+            return self._session.act(step, diagnose=False).success
+
     @contextmanager
     def _in_thought(self) -> Iterator[None]:
         """What is moved inside is where it was at the end."""

@@ -112,7 +112,7 @@ def test_what_is_poured_arrives(robot: str) -> None:
     assert world.object("Cup_1").state.fillLitres == had, "carried level, nothing is lost"
     assert _code(session, f"Pour(right, {TABLE})") == "NotFillable"
     _play(session, "Pour(right, Bowl_1)")
-    assert world.object("Bowl_1").state.fillLitres >= 0.9 * had and world.object("Bowl_1").state.fillLiquid == "wine"
+    assert world.object("Bowl_1").state.fillLitres >= 0.75 * had and world.object("Bowl_1").state.fillLiquid == "wine"
     assert world.object("Cup_1").state.fillLitres < 0.01 and world.grasps.held("right") == "Cup_1"
     assert world.liquids.balance_l() == pytest.approx(0.0, abs=1e-9)
     assert _code(session, "Pour(right, Bowl_1)") == "Empty"
