@@ -282,7 +282,7 @@ def _finite(name: str, value: float) -> float:
 
 
 class _Repetition:
-    """Whether the last steps repeat the same one or two with the same outcome, and left everything as it was.
+    """Whether the last steps are only one or two different ones, each always with the same outcome, view and place.
 
     Args:
         steps: how many; 0 never says so.
@@ -306,9 +306,11 @@ class _Repetition:
     @property
     def stuck(self) -> bool:
         """Whether it is so."""
-        marks = list(self._marks)
-        return 0 < len(marks) == self._steps and all(
-            now[0] == before[0] and math.dist(now[1], before[1]) < _MOVED for before, now in zip(marks, marks[2:], strict=False)
+        first = dict(reversed(self._marks))
+        return (
+            0 < len(self._marks) == self._steps
+            and len(first) <= 2
+            and all(math.dist(place, first[mark]) < _MOVED for mark, place in self._marks)
         )
 
 
