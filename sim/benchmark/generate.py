@@ -185,10 +185,11 @@ def _digest(task: Task) -> str:
     return hashlib.sha256(json.dumps(task.to_json(), sort_keys=True).encode()).hexdigest()[:12]
 
 
-def more_seeds(task: Task) -> range:
-    """All seeds of the slot that a task comes from."""
-    (first,) = (slot.seeds.start for slot in slots() if (slot.family, slot.room) == (task.family, task.room))
-    return range(first, first + _SEEDS_PER_SLOT)
+def more_seeds(task: Task) -> Iterator[tuple[str, int]]:
+    """Rooms and seeds that may give a task in another's place: all of its own room, then those of its family's other rooms."""
+    family = [slot for slot in slots() if slot.family == task.family]
+    for slot in sorted(family, key=lambda slot: (slot.room != task.room, slot.spare)):
+        yield from ((slot.room, seed) for seed in range(slot.seeds.start, slot.seeds.start + _SEEDS_PER_SLOT))
 
 
 def _fill_star(arguments: tuple[Slot, Path]) -> list[tuple[Task, tuple[Certificate, ...]]]:

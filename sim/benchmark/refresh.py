@@ -1,7 +1,7 @@
 """Solves the benchmark's tasks again: to bring their certificates to the present physics, or to see what drifted.
 
 One-armed steps are solved again only where a plan has changed. A task that a robot no longer solves as its category says makes
-room for a fresh draw of its family and room. What has been solved is kept, one line a task, so that it goes on where it was
+room for a fresh draw of its family, of its room where that can be. What has been solved is kept, one line a task, so that it goes on where it was
 stopped.
 """
 
@@ -56,9 +56,7 @@ def solve_again(
         for (task, _, _), result in tqdm(results, total=len(tasks), initial=len(found), desc="tasks", unit="task"):
             found[task.id] = result
             if kept is not None:
-                kept.parent.mkdir(parents=True, exist_ok=True)
-                with kept.open("a", encoding="utf-8") as log:
-                    log.write(json.dumps({"id": task.id, "robots": list(robots)} | _to_line(result)) + "\n")
+                _keep(kept, task, robots, result)
     return [found[task.id] for task in tasks]
 
 
@@ -95,9 +93,9 @@ def refresh(
             made.append(task)
             continue
         if isinstance(now, str):
-            fresh, own = _replacement(task, [*standing, *made])
-            replaced.append(f"{task.id}: {now}; {fresh.id} stands in")
-            now = fresh, own
+            why, now = now, _replacement(task, [*standing, *made])
+            _keep(kept, task, robots, now)
+            replaced.append(f"{task.id}: {why}; {now[0].id} stands in")
         made.append(now[0])
         proofs[now[0].id] = list(now[1])
     return made, [proof for task in made for proof in proofs[task.id]], replaced
@@ -126,16 +124,18 @@ def drift(task: Task, old: Sequence[Certificate], now: Solved) -> Iterator[str]:
 
 
 def _replacement(task: Task, others: Sequence[Task]) -> tuple[Task, tuple[Certificate, ...]]:
-    slot = [other for other in others if (other.family, other.room) == (task.family, task.room)]
     used = {other.seed for other in others} | {task.seed}
-    for seed in (seed for seed in more_seeds(task) if seed not in used):
+    for room, seed in more_seeds(task):
+        if seed in used:
+            continue
+        slot = [other for other in others if (other.family, other.room) == (task.family, room)]
         try:
-            fresh = sample_task(seed, task.room, task.family, "benchmark")
+            fresh = sample_task(seed, room, task.family, "benchmark")
             if fits(fresh, slot, len(slot) + 1):
                 return certified(fresh)
         except (ValueError, WorldError):
             continue
-    raise RuntimeError(f"{task.id} is solved no more, and no seed of {task.family} in {task.room} stands in for it")
+    raise RuntimeError(f"{task.id} is solved no more, and no seed of {task.family} stands in for it")
 
 
 def _solved(job: _Job) -> Solved:
@@ -144,6 +144,13 @@ def _solved(job: _Job) -> Solved:
         return certified(task, old, robots)
     except (ValueError, WorldError) as error:
         return str(error)
+
+
+def _keep(kept: Path, task: Task, robots: Sequence[str], result: Solved) -> None:
+    """Notes what a task has become: solved, refused, or another that stands in for it."""
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    with kept.open("a", encoding="utf-8") as log:
+        log.write(json.dumps({"id": task.id, "robots": list(robots)} | _to_line(result)) + "\n")
 
 
 def _to_line(result: Solved) -> dict[str, object]:
