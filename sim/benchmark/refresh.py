@@ -1,8 +1,8 @@
 """Solves the benchmark's tasks again: to bring their certificates to the present physics, or to see what drifted.
 
 One-armed steps are solved again only where a plan has changed. A task that a robot no longer solves as its category says makes
-room for a fresh draw of its family, of its room where that can be. What has been solved is kept, one line a task, so that it goes on where it was
-stopped.
+room for a fresh draw of its family, in its room where that can be. What has been solved is kept, one line a task, so that it
+goes on where it was stopped.
 """
 
 from __future__ import annotations
