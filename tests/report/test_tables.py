@@ -51,11 +51,12 @@ def test_report_files_agree_and_end_with_all(tmp_path, run) -> None:
     rows = list(csv.reader(io.StringIO((folder / "table.csv").read_text())))
     for row, cells in zip(summary["rows"], rows[1:], strict=True):
         assert cells[1].endswith(f" {row['successes']}/{row['episodes']}")
+        assert cells[2].endswith(f" {row['in_time']}/{row['episodes']}")
         assert row["navigation"] + row["body_adjustment"] + row["logical"] == row["episodes"] - row["successes"]
     assert summary["complete"]
     assert summary["provenance"]["command"].startswith("python eval.py")
     markdown = (folder / "table.md").read_text().splitlines()
-    assert markdown[-1].startswith("| all")
+    assert [line for line in markdown if line.startswith("|")][-1].startswith("| all")
     buffer = io.StringIO()
     table.show(Console(file=buffer, width=140))
     assert buffer.getvalue().rstrip().splitlines()[-1].lstrip().startswith("all")

@@ -10,7 +10,8 @@ from proprio_mllm.evaluation.episode import EpisodeKeyFields, Limits, run_episod
 from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.chat.dag_plan.planner import DagPlanner
 from proprio_mllm.planners.chat.options import ChatOptions
-from sim.tasks.task import Task, load_benchmark
+from sim.tasks.sample import sample_task
+from sim.tasks.task import Task
 from tests.planners.chat.dag_plan.graphs import carried, node, reply
 from tests.planners.chat.script import Script
 
@@ -21,7 +22,7 @@ STEPS = 20
 @pytest.fixture(scope="module")
 def task() -> Task:
     """Sponge and tomato are taken out of a drawer and put on a counter."""
-    return next(task for task in load_benchmark() if task.id == "benchmark_fetch_two_22801")
+    return sample_task(22801, "kitchen_1", "fetch_two", "benchmark")
 
 
 def episode(task: Task, parallel: bool) -> EpisodeRecord:
