@@ -44,7 +44,7 @@ def test_both_arms_need_fewer_steps_and_less_time_in_the_simulator(task: Task) -
     for record in (both, one):
         assert record.outcome is Outcome.SUCCESS, record.message or record.trace
         assert (record.planner_calls, record.invalid_output, record.reflections) == (1, 0, 0)
-    assert both.steps <= task.time_limit < one.steps
+    assert both.steps < one.steps
     assert both.makespan_s < one.makespan_s
     assert both.arm_utilisation > one.arm_utilisation
     assert any("&" in str(entry["step"]) for entry in both.trace)
