@@ -59,15 +59,16 @@ class BenchmarkConfig:
 
     do: Literal["check_fast", "check", "refresh", "table", "generate"] = "check_fast"
     family: str | None = None
-    robot: Literal["h1", "x1"] | None = None
+    robot: str | None = None
     workers: int = 2
     kept: str = ""
     release: bool = False
 
     def __post_init__(self) -> None:
         families = sorted({task.family for task in load_benchmark()})
-        if self.family is not None and self.family not in families:
-            raise ValueError(f"family: {self.family!r} is not allowed; {allowed_values(self.family, families)}")
+        for name, value, allowed in (("family", self.family, families), ("robot", self.robot, PAPER_ROBOTS)):
+            if value is not None and value not in allowed:
+                raise ValueError(f"{name}: {value!r} is not allowed; {allowed_values(value, allowed)}")
 
 
 def stale_note() -> str:

@@ -174,7 +174,7 @@ def test_what_was_run_and_what_it_cost_is_in_the_metadata(cfg, session) -> None:
     assert run(cfg, session, backend=script(cfg, "flaky")).folder != result.folder
     assert result.folder.name.startswith("gpt4o-script-h1-easy-steps_task-tasks-")
     told = dataclasses.replace(cfg.planner, body=True, horizon=2, reflection="off")
-    assert "-easy-no_reflection-body-horizon2-tasks-" in run_folder(dataclasses.replace(cfg, planner=told), "").name
+    assert "-easy-steps_task-no_reflection-body-horizon2-tasks-" in run_folder(dataclasses.replace(cfg, planner=told), "").name
 
 
 OWN_PROMPT = Path(__file__).parents[2] / "examples" / "own_prompt.py"
