@@ -46,7 +46,15 @@ def test_a_planner_asks_the_served_model_and_repeats_the_run_without_it(
     planner: str, url: str, memory: Path, tmp_path: Path
 ) -> None:
     cache = tmp_path / "replies.sqlite"
-    values = [f"planner={planner}", "backend=serve", f"backend.base_url={url}", f"backend.cache={cache}", "robot=x1", "limit=1"]
+    values = [
+        f"planner={planner}",
+        "backend=serve",
+        f"backend.base_url={url}",
+        f"backend.cache={cache}",
+        "robot=x1",
+        "limit=1",
+        "steps=task",
+    ]
     values += [f"planner.memory={memory}"] if planner in ("llm_planner", "rap") else []
     cfg = build(EvalConfig, compose("eval", [*values, "workers=0", "threads=3", f"output={tmp_path / 'a'}"]))
     first = evaluate(cfg)

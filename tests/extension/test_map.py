@@ -92,7 +92,7 @@ def test_a_third_robot_needs_no_code(assets: Path, tmp_path: Path) -> None:
     code = (
         "import sys, eval, train\n"
         "out = 'output=' + sys.argv[1]\n"
-        "assert eval.main(['robot=stubby', 'planner=scripted', 'limit=1', 'workers=1', out]) == 0\n"
+        "assert eval.main(['robot=stubby', 'planner=scripted', 'limit=1', 'steps=task', 'workers=1', out]) == 0\n"
         "words = ['model=tiny', 'budget=debug', 'data.robots=[stubby]', 'data.clips=4', out]\n"
         "assert train.main(['stage=data', *words]) == 0\n"
         "assert train.main(['stage=collect', 'collect.views=8', 'collect.episodes=2', *words]) == 0\n"
@@ -108,8 +108,8 @@ def test_a_planner_is_a_file(tmp_path: Path) -> None:
     planner.write_text((ROOT / "examples" / "own_planner.py").read_text(encoding="utf-8"), encoding="utf-8")
     code = (
         "import sys, eval\n"
-        "words = ['planner=file', 'planner.source=' + sys.argv[2] + ':Nearby', 'limit=1', 'output=' + sys.argv[1]]\n"
-        "assert eval.main(words) == 0\n"
+        "words = ['planner=file', 'planner.source=' + sys.argv[2] + ':Nearby', 'limit=1', 'steps=task']\n"
+        "assert eval.main([*words, 'output=' + sys.argv[1]]) == 0\n"
         "print('works')\n"
     )
     done = ran(code, ROOT, str(tmp_path / "outputs"), str(planner))
