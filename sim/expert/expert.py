@@ -1,8 +1,8 @@
 """The privileged expert: a planner that may look at the simulator's state. It certifies tasks and gives demonstrations.
 
 What comes next follows from goals and object states (`sim.expert.jobs`); whether an arm can do it from here, and how much lower
-or higher the pelvis would have to be, from the simulator's own reach test (`Session.assess`), which moves nothing. What is put
-down is put down in thought first, since what falls to the floor is lost. The style is canonical on purpose, so that a small
+or higher the pelvis would have to be, from the simulator's own reach test (`Session.assess`), which moves nothing. A load of
+both hands is put down in thought first, since it is lost when it falls. The style is canonical on purpose, so that a small
 model can imitate it: GoTo, then MoveDown or MoveUp where the arm needs it, then the arm action, on both arms at once where both
 can reach. The expert re-plans from the current state at every step, so failures and perturbations need no special case; when
 something else than its step was done, it forgets having proposed it, so that the same state gets the same step. It is marked
@@ -214,10 +214,9 @@ class Expert:
             if refusal is None:
                 verdict = self._session.assess(action)
                 if verdict is None and self._leads_on(head, arm, facts):
-                    both = self._with_companion(head, arm, jobs[1:], facts)
-                    lasting = next((step for step in (both, _single(action)) if self._lasts(step)), None)
-                    if lasting is not None:
-                        return lasting
+                    step = self._with_companion(head, arm, jobs[1:], facts)
+                    if self._lasts(step):
+                        return step
                 refusal = _Refusal(action.to_text(), self._here(), verdict)
                 self._memory.refusals.append(refusal)
             if refusal.verdict is not None:
@@ -333,8 +332,9 @@ class Expert:
         return following.arm in self._usable and self._rehearsal.leads_to(job.action(arm), following)
 
     def _lasts(self, step: PlanStep) -> bool:
-        """Whether what a step puts down stays there; what falls to the floor is lost, so it is acted out in thought first."""
-        return not any(action.spec.has_effect(PutDown) for action in step.actions) or self._rehearsal.succeeds(step)
+        """Whether what both hands put down stays there; it is put down in thought first, since it is lost when it falls."""
+        both = any(action.spec.arms == 2 and action.spec.has_effect(PutDown) for action in step.actions)
+        return not both or self._rehearsal.succeeds(step)
 
     def _approach_for_two(self, job: Job, facts: Facts) -> Action:
         """The body action towards a place from where one arm can do a job and the other what follows it."""
