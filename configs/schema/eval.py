@@ -146,8 +146,8 @@ class EvalConfig:
         category: tasks of one category, or all.
         trials: episodes per task; the luck and the random streams differ between trials.
         steps: charged steps of an episode, 50 in the paper; `task` ends it at the task's time limit.
-        stuck: an episode ends when its last so many steps only repeat one or two with the same outcome and change nothing; 0
-            lets it run on.
+        stuck: an episode ends when its last so many steps are only one or two different ones, each with the same outcome, view
+            and place every time; 0 lets it run on.
         start: `fixed` starts where the task says, `turned` there with a heading drawn per trial, `random` anywhere free in the
             room with heading and pelvis height drawn per trial.
         split: tasks whose `split` this is, or all.

@@ -26,10 +26,12 @@ from data.files import write_text
 from data.interface.bodies import PAPER_ROBOTS
 from sim.benchmark.certificates import (
     CERTIFICATES_PATH,
+    Certificate,
     certificates_table,
     certificates_text,
     load_certificates,
 )
+from sim.benchmark.composition import COMPOSITION
 from sim.benchmark.generate import counts, generate
 from sim.benchmark.refresh import drift, refresh, solve_again
 from sim.scene.compiler import PHYSICS
@@ -65,15 +67,14 @@ class BenchmarkConfig:
     release: bool = False
 
     def __post_init__(self) -> None:
-        families = sorted({task.family for task in load_benchmark()})
+        families = sorted(share.family for share in COMPOSITION if share.count)
         for name, value, allowed in (("family", self.family, families), ("robot", self.robot, PAPER_ROBOTS)):
             if value is not None and value not in allowed:
                 raise ValueError(f"{name}: {value!r} is not allowed; {allowed_values(value, allowed)}")
 
 
-def stale_note() -> str:
+def stale_note(proofs: Sequence[Certificate]) -> str:
     """How many certificates are of another physics than the present one; empty when none is."""
-    proofs = load_certificates()
     stale = [proof for proof in proofs if proof.stale]
     if not stale:
         return ""
@@ -135,7 +136,7 @@ def main(arguments: Sequence[str]) -> int:
                 again = solve_again(chosen, certificates, robots, options.workers)
                 for task, now in zip(chosen, again, strict=True):
                     problems += drift(task, [proof for proof in certificates if proof.task == task.id], now)
-            note = stale_note()
+            note = stale_note(certificates)
             if note and options.release:
                 problems.append(note)
             elif note:

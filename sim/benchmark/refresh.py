@@ -96,6 +96,8 @@ def refresh(
             why, now = now, _replacement(task, [*standing, *made])
             _keep(kept, task, robots, now)
             replaced.append(f"{task.id}: {why}; {now[0].id} stands in")
+        elif now[0].id != task.id:  # found before the refresh was stopped
+            replaced.append(f"{task.id}: {now[0].id} stands in")
         made.append(now[0])
         proofs[now[0].id] = list(now[1])
     return made, [proof for task in made for proof in proofs[task.id]], replaced

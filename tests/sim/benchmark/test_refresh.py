@@ -86,7 +86,7 @@ def test_a_task_that_is_refused_has_drifted() -> None:
 
 def test_certificates_are_of_the_present_physics() -> None:
     """A warning between releases; `make release-check` makes it an error."""
-    if note := stale_note():
+    if note := stale_note(load_certificates()):
         warnings.warn(note, stacklevel=1)
 
 
