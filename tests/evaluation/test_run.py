@@ -15,7 +15,7 @@ import pytest
 import configs
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
-from data.interface.episode import Outcome
+from data.interface.episode import STEP_LIMIT, Outcome
 from proprio_mllm.evaluation import run as running
 from proprio_mllm.evaluation.ledger import Ledger, LedgerError, read_ledger
 from proprio_mllm.evaluation.run import config_hash, evaluate, plan_episodes, run_folder, select_tasks, weights_digest
@@ -246,3 +246,13 @@ def test_contingencies_of_ones_own_are_other_results(cfg, session, tmp_path, mon
     assert config_hash(other, "") != before
     with pytest.raises(ValueError, match=r"no contingency config 'nope'; allowed: default, unlucky"):
         evaluate(dataclasses.replace(cfg, contingencies="nope"), opener)
+
+
+def test_what_ends_an_episode_and_the_physics_make_another_run(cfg, monkeypatch) -> None:
+    hashes = [
+        config_hash(dataclasses.replace(cfg, **change), "") for change in ({}, {"steps": "task"}, {"steps": 20}, {"stuck": 0})
+    ]
+    monkeypatch.setattr(running, "PHYSICS", running.PHYSICS + 1)
+    hashes.append(config_hash(cfg, ""))
+    assert len(set(hashes)) == 5
+    assert (EvalConfig.steps, cfg.steps) == (STEP_LIMIT, STEP_LIMIT), "the paper's limit is written in two layers"

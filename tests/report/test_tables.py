@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 from pathlib import Path
@@ -21,7 +22,8 @@ from proprio_mllm.report.experiments import EXPERIMENTS, ablation_table, assembl
 from proprio_mllm.report.runs import find_runs, load_run, newest, run_notes, run_report, write_report
 from proprio_mllm.report.statistics import wilson
 from proprio_mllm.report.summary import rows_of
-from proprio_mllm.report.table import Table, rate_cell, run_table
+from proprio_mllm.report.table import Table, in_time_cell, rate_cell, run_table
+from tests.report.ledgers import LAMP, record_of
 
 
 def test_rows_count_and_add_up(record) -> None:
@@ -285,3 +287,14 @@ def test_a_damaged_neighbour_does_not_cost_a_run_its_report(tmp_path: Path, run,
     assert (folder / "summary.json").is_file()
     assert f"left out as a reference: {other / 'run.json'}: not JSON" in caplog.text
     assert f"left out as a reference: {expert / 'ledger.jsonl'}, line 1" in caplog.text
+
+
+def test_success_in_time_is_counted_apart_from_success() -> None:
+    records = [
+        record_of(dataclasses.replace(LAMP, id=f"t{number}"), "h1", "c", success, [], in_time=in_time, stuck=stuck)
+        for number, (success, in_time, stuck) in enumerate([(True, True, False), (True, False, False), (False, False, True)])
+    ]
+    row = rows_of(records)[-1]
+    assert (row.successes, row.in_time, row.stuck, row.episodes) == (2, 1, 1, 3)
+    assert (row.in_time_rate, row.in_time_low, row.in_time_high) == pytest.approx((1 / 3, *wilson(1, 3)))
+    assert in_time_cell(row) == "33.3 [6.1, 79.2] 1/3" and rate_cell(row).endswith("2/3")

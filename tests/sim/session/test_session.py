@@ -162,3 +162,14 @@ def test_a_robot_described_elsewhere_acts(tmp_path: Path) -> None:
         assert session.assess(PlanStep.parse("Pick(left, StoveKnob_2)").actions[0]) is not None
     finally:
         session.close()
+
+
+def test_what_is_visible_does_not_depend_on_the_picture() -> None:
+    seen = set()
+    for size in (0, 16, 112, 200):
+        made = Session("h1", "easy", size)
+        observation = made.reset(TASK, 3)
+        assert observation.image.shape == (size, size, 3)
+        seen.add((observation.visible_objects, observation.known_objects))
+        made.close()
+    assert len(seen) == 1 and "Mug_1" in next(iter(seen))[0]
