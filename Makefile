@@ -26,9 +26,8 @@ $(STAMP): requirements.lock pyproject.toml
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
-# Eight episodes side by side in one process: on two cores that is faster than a process a core, and gives the same episodes.
 eval: $(STAMP)
-	$(BIN)/python eval.py planner=proprio robot=h1 workers=0 batch=8
+	$(BIN)/python eval.py planner=proprio robot=h1
 
 # The tests but those marked `slow`, on all cores up to four.
 test: $(STAMP)
