@@ -8,11 +8,10 @@ their ranges. What is wrong is printed with the seed and the number of the call,
 from __future__ import annotations
 
 import logging
-import multiprocessing
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -24,7 +23,7 @@ from configs.arguments import command, read_arguments
 from configs.validate import ConfigError
 from data.interface.actions import ACTIONS, ActionKind
 from data.interface.failures import FAILURES
-from data.workers import start_worker
+from data.workers import worker_pool
 from sim.interfaces.aliases import ALIASES
 from sim.interfaces.controller import Controller, Event
 from sim.robots.spec import available_robots
@@ -329,8 +328,7 @@ def _tallies(config: FuzzConfig) -> Iterator[Tally]:
         for index in range(config.worlds):
             yield run_world(config, index)
         return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(config.workers, mp_context=context, initializer=start_worker) as pool:
+    with worker_pool(config.workers) as pool:
         for future in as_completed([pool.submit(run_world, config, index) for index in range(config.worlds)]):
             yield future.result()
 

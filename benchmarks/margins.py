@@ -8,10 +8,8 @@ does not notice either. Not part of any experiment.
 from __future__ import annotations
 
 import json
-import multiprocessing
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import mujoco
@@ -19,7 +17,7 @@ import numpy as np
 
 from configs.arguments import command, read_arguments
 from data.interface.bodies import PAPER_ROBOTS
-from data.workers import start_worker
+from data.workers import worker_pool
 from proprio_mllm.report.statistics import wilson
 from sim.expert.expert import Expert
 from sim.session.session import Session
@@ -76,7 +74,7 @@ def main(arguments: Sequence[str]) -> int:
     config = read_arguments(MarginsConfig, arguments)
     tasks = load_benchmark()
     chosen = np.unique(np.linspace(0, len(tasks) - 1, min(config.tasks, len(tasks))).round().astype(int)).tolist()
-    with ProcessPoolExecutor(config.workers, multiprocessing.get_context("spawn"), start_worker) as pool:
+    with worker_pool(config.workers) as pool:
         for robot in PAPER_ROBOTS:
             jobs = [(robot, index, scale, config.seed) for scale in (0.0, config.disturb) for index in chosen]
             found = list(pool.map(solved, jobs))

@@ -9,11 +9,10 @@ Paper: data preparation for stages 1 and 2 (HumanML3D, PHC filtering, retargetin
 from __future__ import annotations
 
 import dataclasses
-import multiprocessing
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -32,7 +31,7 @@ from data.motion import FPS
 from data.retarget import Retargeter
 from data.shards import Manifest, ShardWriter, config_hash
 from data.sources import clip_ids, read_clip
-from data.workers import start_worker
+from data.workers import worker_pool
 from sim.robots.spec import load_robot
 
 __all__ = ["PartResult", "Pictures", "Replay", "build_clips", "dataset_folder", "part_of_clips"]
@@ -227,8 +226,7 @@ def _computed(
         for index in missing:
             yield index, part_of_clips(cfg, folder, parts[index], replay)
         return
-    context = multiprocessing.get_context("spawn")  # OpenGL and Pinocchio do not survive a fork
-    with ProcessPoolExecutor(min(cfg.workers, len(missing)), mp_context=context, initializer=start_worker) as pool:
+    with worker_pool(min(cfg.workers, len(missing))) as pool:
         futures = {pool.submit(part_of_clips, cfg, folder, parts[index], replay): index for index in missing}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()

@@ -6,14 +6,21 @@ workers to stop, so each watches for its parent's death. Paper: none (engineerin
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import threading
 import time
+from concurrent.futures import ProcessPoolExecutor
 from typing import Final
 
-__all__ = ["start_worker"]
+__all__ = ["start_worker", "worker_pool"]
 
 _POLL_S: Final = 1.0
+
+
+def worker_pool(workers: int) -> ProcessPoolExecutor:
+    """A pool of so many of these processes."""
+    return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), start_worker)
 
 
 def start_worker() -> None:

@@ -14,10 +14,9 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -28,7 +27,7 @@ from data.interface.bodies import PAPER_ROBOTS
 from data.interface.observation import Observation
 from data.interface.steps import PlanStep
 from data.shards import ShardWriter
-from data.workers import start_worker
+from data.workers import worker_pool
 from proprio_mllm.training.rollouts import DaggerRequest
 
 if TYPE_CHECKING:
@@ -73,8 +72,7 @@ def _computed(
                 rows = _part(config, part, model)
             yield part, rows
         return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(missing)), mp_context=context, initializer=start_worker) as pool:
+    with worker_pool(min(workers, len(missing))) as pool:
         futures = {pool.submit(_part, config, part, model): part for part in missing}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()

@@ -158,7 +158,7 @@ def _contingencies_hash(cfg: EvalConfig) -> str:
 
 def task_key(task: Task) -> str:
     """A task's id with a hash of its content, so that an edited task is another one."""
-    return hashlib.sha256(json.dumps(task.to_json(), sort_keys=True).encode()).hexdigest()[:6]
+    return task.content_hash()[:6]
 
 
 def plan_episodes(cfg: EvalConfig, tasks: Sequence[Task], own_hash: str) -> list[EpisodeJob]:

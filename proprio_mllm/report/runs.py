@@ -89,10 +89,10 @@ def write_report(run: Run) -> Table:
                 "start",
                 "steps",
                 "stuck",
+                "seed",
                 "physics",
             )
         }
-        | {"seed": meta["seed"]}
         | {"split": meta.get("split", "all")},
         "complete": run.complete,
         "planned": len(meta["planned"]),

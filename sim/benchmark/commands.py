@@ -20,10 +20,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
+from tqdm import tqdm
+
 from configs.arguments import command, read_arguments
 from configs.validate import allowed_values
 from data.files import write_text
 from data.interface.bodies import PAPER_ROBOTS
+from data.workers import worker_pool
 from sim.benchmark.certificates import (
     CERTIFICATES_PATH,
     Certificate,
@@ -95,15 +98,19 @@ def rebuild(task: Task) -> Task:
     return replace(sample_task(task.seed, task.room, task.family, "benchmark"), time_limit=task.time_limit)
 
 
-def _check(tasks: Sequence[Task]) -> list[str]:
+def _differs(task: Task) -> str:
+    """How a task differs from what its seed makes; empty when it does not."""
+    try:
+        return "" if rebuild(task) == task else f"{task.id}: its seed makes another task"
+    except (ValueError, WorldError) as error:
+        return f"{task.id}: {error}"
+
+
+def _check(tasks: Sequence[Task], workers: int) -> list[str]:
     """Differences between the file of tasks and what its seeds make."""
-    problems: list[str] = []
-    for task in tasks:
-        try:
-            if rebuild(task) != task:
-                problems.append(f"{task.id}: its seed makes another task")
-        except (ValueError, WorldError) as error:
-            problems.append(f"{task.id}: {error}")
+    with worker_pool(workers) as pool:
+        found = tqdm(pool.map(_differs, tasks, chunksize=8), total=len(tasks), desc="draws", unit="task")
+        problems = [problem for problem in found if problem]
     if tasks_text(tasks) != BENCHMARK_PATH.read_text(encoding="utf-8"):
         problems.append(f"{BENCHMARK_PATH.name}: differs in its formatting")
     return problems
@@ -130,7 +137,7 @@ def main(arguments: Sequence[str]) -> int:
             for line in replaced:
                 logger.info("%s", line)
         else:
-            problems = _check(tasks)
+            problems = _check(tasks, options.workers)
             chosen = [task for task in tasks if options.family in (None, task.family)]
             if options.do == "check":
                 again = solve_again(chosen, certificates, robots, options.workers)

@@ -2,26 +2,22 @@
 
 A slot is a family in a room. Its seeds are tried in order, and those tasks are kept whose certificates say what their category
 promises (`sim.benchmark.certificates`), whose instruction is new, and whose subject has not yet been asked for too often. What
-a room cannot give is taken from the family's other rooms.
-Generating takes hours on two cores; what has been tried is kept in `outputs/tasks`, by version of the physics and by
-what was drawn, so that it goes on where it was stopped.
+a room cannot give is taken from the family's other rooms. Generating takes hours on two cores; what has been tried is kept in
+`outputs/tasks`, by version of the physics and by what was drawn, so that it goes on where it was stopped.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
-import multiprocessing
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from tqdm import tqdm
 
-from data.workers import start_worker
+from data.workers import worker_pool
 from sim.benchmark.certificates import Certificate, certified
 from sim.benchmark.composition import COMPOSITION, Share
 from sim.tasks.sample import BIG_TYPES, sample_task
@@ -130,7 +126,7 @@ def fill(slot: Slot, folder: Path) -> list[tuple[Task, tuple[Certificate, ...]]]
                 drawn = sample_task(seed, slot.room, slot.family, "benchmark")
             except (ValueError, WorldError):
                 continue
-            key = seed, _digest(drawn)
+            key = seed, drawn.content_hash()[:12]
             if key not in tried:
                 line: dict[str, Any] = {"seed": seed, "drawn": key[1]}
                 try:
@@ -181,10 +177,6 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in whole.decode().splitlines()]
 
 
-def _digest(task: Task) -> str:
-    return hashlib.sha256(json.dumps(task.to_json(), sort_keys=True).encode()).hexdigest()[:12]
-
-
 def more_seeds(task: Task) -> Iterator[tuple[str, int]]:
     """Rooms and seeds that may give a task in another's place: all of its own room, then those of its family's other rooms."""
     family = [slot for slot in slots() if slot.family == task.family]
@@ -211,8 +203,7 @@ def generate(folder: Path, workers: int = 2) -> tuple[list[Task], list[Certifica
     wanted = {slot.number: slot for slot in slots()}
     totals = {share.family: share.count for share in COMPOSITION}
     search = list(wanted.values())
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, start_worker) as pool:
+    with worker_pool(workers) as pool:
         while search:
             results = pool.map(_fill_star, [(slot, folder) for slot in search])
             for slot, found in zip(search, tqdm(results, total=len(search), desc="slots", unit="slot"), strict=True):

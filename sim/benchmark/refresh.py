@@ -8,15 +8,13 @@ goes on where it was stopped.
 from __future__ import annotations
 
 import json
-import multiprocessing
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Final
 
 from tqdm import tqdm
 
-from data.workers import start_worker
+from data.workers import worker_pool
 from sim.benchmark.certificates import Certificate, certified
 from sim.benchmark.generate import fits, more_seeds, read_lines
 from sim.tasks.sample import sample_task
@@ -51,7 +49,7 @@ def solve_again(
     known = {} if kept is None else {(line["id"], *line["robots"]): _from_line(line) for line in read_lines(kept)}
     found = {task.id: known[task.id, *robots] for task in tasks if (task.id, *robots) in known}
     jobs: list[_Job] = [(task, old.get(task.id, {}), robots) for task in tasks if task.id not in found]
-    with _pool(workers) as pool:
+    with worker_pool(workers) as pool:
         results = zip(jobs, pool.map(_solved, jobs), strict=True)
         for (task, _, _), result in tqdm(results, total=len(tasks), initial=len(found), desc="tasks", unit="task"):
             found[task.id] = result
@@ -165,7 +163,3 @@ def _from_line(line: Mapping[str, object]) -> Solved:
     if "refused" in line:
         return str(line["refused"])
     return Task.from_json(line["task"]), tuple(Certificate.from_json(proof) for proof in line["proofs"])  # type: ignore[arg-type]
-
-
-def _pool(workers: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), start_worker)

@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import multiprocessing
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from configs.arguments import command, read_arguments
 from configs.schema.collect import CollectConfig
 from data.shards import Manifest, ShardWriter, config_hash
-from data.workers import start_worker
+from data.workers import worker_pool
 
 __all__ = ["collect", "main", "parts_of", "rows_of_part"]
 
@@ -107,8 +106,7 @@ def _computed(config: CollectConfig, missing: Sequence[int]) -> Iterator[tuple[i
         for part in missing:
             yield part, rows_of_part(config, part)
         return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(config.workers, len(missing)), mp_context=context, initializer=start_worker) as pool:
+    with worker_pool(min(config.workers, len(missing))) as pool:
         futures = {pool.submit(rows_of_part, config, part): part for part in missing}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()

@@ -6,6 +6,7 @@ DualTHOR task suite with its categories (single-arm, dual-arm optional, dual-arm
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping
@@ -165,6 +166,10 @@ class Task:
             "split": self.split,
             "seed": self.seed,
         }
+
+    def content_hash(self) -> str:
+        """Hash of everything in it (SHA-256, hexadecimal), so that an edited task is told from what it was."""
+        return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()
 
     @staticmethod
     def from_json(record: Mapping[str, Any]) -> Task:

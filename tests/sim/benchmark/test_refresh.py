@@ -93,7 +93,7 @@ def test_certificates_are_of_the_present_physics() -> None:
 def test_stale_certificates_are_an_error_of_a_release(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(commands, "_check", lambda tasks: [])
+    monkeypatch.setattr(commands, "_check", lambda tasks, workers: [])
     monkeypatch.setattr(commands, "load_certificates", lambda: [dataclasses.replace(proof, physics=0) for proof in PROOFS])
     assert main([]) == 0
     assert main(["release=true"]) == 1
