@@ -220,6 +220,7 @@ class ModelConfig:
         vocab_size: rows of the tokenizer trained on the project's text; ignored with `weights`.
         dtype: parameter type.
         history: earlier steps shown to the planner.
+        episodes: whether it plans from whole episodes in words (`proprio_mllm.model.wording`) in place of prompts.
         proprioception: whether prompts carry motion tokens.
     """
 
@@ -227,6 +228,7 @@ class ModelConfig:
     weights: str | None = None
     image_size: int = 112
     prompt: Literal["terse", "full"] = "terse"
+    episodes: bool = False
     vocab_size: int = 1400
     dtype: Literal["float32", "bfloat16"] = "float32"
     history: int = 4

@@ -24,7 +24,7 @@ __all__ = [
 
 #: Training tasks have 2^31 seeds, a million for each seed of a run.
 LARGEST_SEED = 2000
-StageName = Literal["all", "data", "collect", "base", "dagger", "pointmap", "tokenizer", "alignment", "selu"]
+StageName = Literal["all", "data", "collect", "words", "base", "dagger", "pointmap", "tokenizer", "alignment", "selu"]
 Variant = Literal["full", "no_mpe", "no_cse", "no_mpe_cse", "no_proprio"]
 
 
@@ -221,6 +221,7 @@ class TrainConfig:
         variant: which ablation of the model. `no_proprio` trains on the same data without motion tokens, MPE and CSE: what the
             stages bring without proprioception.
         model: the model.
+        words: loop of `stage=words`; an example is a whole episode.
         output: folder of all outputs.
         seed: seed of data order, initial weights and rollouts.
         threads: torch threads; 0 leaves torch's choice.
@@ -240,6 +241,7 @@ class TrainConfig:
     tokenizer: LoopConfig
     alignment: AlignmentConfig
     selu: SeluConfig
+    words: LoopConfig
     data: DataConfig = field(default_factory=DataConfig)
     collect: CollectStageConfig = field(default_factory=CollectStageConfig)
     dagger: DaggerConfig = field(default_factory=DaggerConfig)

@@ -26,8 +26,11 @@ __all__ = ["CHAT_PLANNERS", "PLANNERS", "make_chat_planner", "make_planner"]
 
 def _mllm(cfg: PlannerConfig) -> Planner:
     from proprio_mllm.planners.mllm import MllmPlanner  # torch loads only where a model is used
+    from proprio_mllm.planners.words import WordsPlanner, plans_in_words
 
     assert cfg.weights is not None
+    if plans_in_words(cfg.weights):
+        return WordsPlanner.load(cfg.weights, cfg.temperature, cfg.train)
     return MllmPlanner.load(
         cfg.weights, cfg.adapter, cfg.temperature, cfg.max_new_tokens, cfg.train, reflection=cfg.reflection == "on"
     )

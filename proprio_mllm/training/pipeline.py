@@ -15,12 +15,23 @@ from typing import Any, Protocol, get_args
 
 from configs.schema.model import ModelConfig
 from configs.schema.train import LoopConfig, TrainConfig, Variant
+from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.loop import Objective, run_loop
 from proprio_mllm.training.metrics import MetricWriter
 from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_key
 from proprio_mllm.training.sources import shard_hash
 
-__all__ = ["Metrics", "Pipeline", "Stage", "StageError", "base_model_config", "loop_values", "seeded", "variant_model"]
+__all__ = [
+    "LessonSource",
+    "Metrics",
+    "Pipeline",
+    "Stage",
+    "StageError",
+    "base_model_config",
+    "loop_values",
+    "seeded",
+    "variant_model",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -29,6 +40,18 @@ Metrics = dict[str, float]
 
 class StageError(RuntimeError):
     """A stage that cannot start; the message names the command to run first."""
+
+
+class LessonSource(Protocol):
+    """Where episodes in words come from."""
+
+    def words(self) -> tuple[str, ...]:
+        """Every word that occurs in them, apart from made-up names."""
+        ...
+
+    def episode(self, seed: int) -> WordEpisode:
+        """The episode of a seed; negative ones are held out."""
+        ...
 
 
 class Stage(Protocol):
@@ -108,6 +131,7 @@ class Pipeline:
             training does not know the simulator.
         command: the command line, stored with every finished stage.
         collect_dagger: lets a model act in the simulator and writes the teacher's corrections; given likewise.
+        lessons: makes episodes in words with a teacher's answers; given likewise.
     """
 
     def __init__(
@@ -117,10 +141,11 @@ class Pipeline:
         collect_rollouts: Callable[..., Any] | None = None,
         command: str = "",
         collect_dagger: Callable[..., Any] | None = None,
+        lessons: LessonSource | None = None,
     ) -> None:
         self.stages, self.cfg, self.command = stages, cfg, command
         self.paths = StagePaths(cfg)
-        self.collect_rollouts, self.collect_dagger = collect_rollouts, collect_dagger
+        self.collect_rollouts, self.collect_dagger, self.lessons = collect_rollouts, collect_dagger, lessons
         self._taken: Metrics = {}  # steps of each run of the current stage: a time budget may end it early
 
     def key(self, name: str) -> str:

@@ -34,6 +34,7 @@ from sim.tasks.sample import UNSEEN_TYPES, rng_for, scene_of
 __all__ = [
     "TextEpisode",
     "dagger_of_part",
+    "draw_task",
     "goal_question",
     "goal_questions_of_part",
     "play",
@@ -149,7 +150,7 @@ class _Episode:
 
     def __init__(self, config: CollectConfig, index: int, name: str) -> None:
         self.rng = rng_for(name, config.seed, index)
-        draft, scene = _draft(config, self.rng)
+        draft, scene = draw_task(config.rooms, self.rng)
         robot = config.robots[index % len(config.robots)]
         self.world = TextWorld(draft, scene, load_robot(robot), self.rng)
         hidden = [obj for obj in draft.objects if obj not in self.world.seen]
@@ -228,7 +229,7 @@ def goal_question(config: CollectConfig, index: int) -> dict[str, Any]:
     if rng.random() < 0.5:
         return {**end, "target": "yes"}
     if rng.random() < 0.2:
-        other, scene = _draft(config, rng)
+        other, scene = draw_task(config.rooms, rng)
         instruction = other.sentences(scene.furniture, rng)[0]
         target = "no" if instruction != end["instruction"] else "yes"
         return {**end, "instruction": instruction, "named": list(other.focus.values()), "target": target}
@@ -239,10 +240,10 @@ def goal_question(config: CollectConfig, index: int) -> dict[str, Any]:
     return {**before, "target": "no"}
 
 
-def _draft(config: CollectConfig, rng: np.random.Generator) -> tuple[Draft, Scene]:
-    """A task in one of the rooms or in a made-up one."""
+def draw_task(rooms: Sequence[str], rng: np.random.Generator) -> tuple[Draft, Scene]:
+    """A task in one of some rooms or in a made-up one."""
     while True:
-        scene = scene_of(str(rng.choice(config.rooms))) if rng.random() < 0.5 else _made_up(rng)
+        scene = scene_of(str(rng.choice(rooms))) if rng.random() < 0.5 else _made_up(rng)
         category = str(rng.choice(CATEGORIES))
         family = str(rng.choice([name for name in FAMILIES if FAMILIES[name].category == category]))
         try:

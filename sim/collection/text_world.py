@@ -27,10 +27,16 @@ __all__ = ["TextWorld"]
 
 _HEIGHT_STEP_M: Final = 0.05
 #: Pelvis heights relative to upright, metres.
-_LOWEST_M, _HIGHEST_M = -0.5, 0.2
+_LOWEST_M, _HIGHEST_M = -0.5, 0.0
 #: What physics says to an action that was right, with a probability: once, or every time from the same stance.
 _BAD_LUCK: Final = 0.02
 _AWKWARD: Final = 0.08
+#: How often what one has walked to is still out of reach, by robot, and how often a walk is blocked or has no free end; how
+#: wide the range of pelvis heights is from which a piece of furniture is reached, metres. Measured with the teacher's steps.
+_FAR: Final = {"h1": 0.08, "x1": 0.33}
+_BLOCKED: Final = 0.05
+_NO_POSE: Final = 0.35
+_BAND_M: Final = {"h1": (0.05, 0.2), "x1": (0.15, 0.4)}
 #: Codes that come back from the same stance every time.
 _MISHAPS: Final = (
     FailureCode.GRASP_MISSED,
@@ -38,6 +44,7 @@ _MISHAPS: Final = (
     FailureCode.HANDLE_SLIPPED,
     FailureCode.TOOL_MISSED,
     FailureCode.POUR_MISSED,
+    FailureCode.RECEPTACLE_FULL,
 )
 #: Sides from which to try again.
 _BEARINGS_DEG: Final = (-20.0, 20.0)
@@ -56,9 +63,9 @@ class TextWorld:
     """
 
     def __init__(self, draft: Draft, scene: Scene, robot: RobotSpec, rng: np.random.Generator) -> None:
-        self._draft, self._scene, self._rng = draft, scene, rng
+        self._draft, self._scene, self._rng, self._robot = draft, scene, rng, robot.name
         self.facts = TextFacts(draft, scene, robot)
-        self._height_m = float(rng.choice((0.0, 0.0, -0.1, -0.2)))
+        self._height_m = float(rng.choice((0.0, -0.1, -0.2, -0.3)))
         self._bands = {name: self._band() for name in scene.furniture}
         #: Whether a refusal has told the robot that its height is wrong here.
         self._told = False
@@ -70,9 +77,11 @@ class TextWorld:
         self._approaches = 0
         self._at, self._near, self._left_first = "", set[str](), False
         focus = next(iter(draft.focus.values()))
-        self._arrive(focus if focus in scene.furniture else draft.objects[focus], near=False)
-        if rng.random() < 0.4:
-            self._arrive(str(rng.choice(scene.furniture)), near=False)
+        there = rng.random() < 0.45
+        self._arrive(
+            (focus if focus in scene.furniture else draft.objects[focus]) if there else str(rng.choice(scene.furniture)),
+            near=False,
+        )
         if rng.random() < 0.6:
             self._at = ""
 
@@ -84,8 +93,8 @@ class TextWorld:
 
     def _band(self) -> tuple[float, float]:
         """Pelvis heights from which the arms reach what a piece of furniture carries."""
-        middle = float(self._rng.choice((-0.05, -0.05, -0.05, -0.15, -0.3, 0.1)))
-        half = float(self._rng.uniform(0.05, 0.2))
+        middle = float(self._rng.choice((-0.05, -0.05, -0.05, -0.1, -0.2, -0.35)))
+        half = float(self._rng.uniform(*_BAND_M.get(self._robot, (0.1, 0.3))))
         return middle - half, middle + half
 
     def _place(self, name: str) -> str | None:
@@ -133,7 +142,14 @@ class TextWorld:
         self.visible = [*(name for name in ids if name in shown), *(name for name in self.facts.objs if name in seen)]
         self._near = set()
         if near:
-            self._near = {place, *(name for name in objs if name == wanted or self._rng.random() < 0.6)}
+            far = _FAR.get(self._robot, 0.2)
+            self._near = {name for name in objs if self._rng.random() < (1.0 - far if name == wanted else 0.6)}
+            if wanted != place or self._rng.random() >= far:
+                self._near.add(place)
+
+    def done(self) -> bool:
+        """Whether every goal holds."""
+        return not plan_jobs(self._draft.goals, self.facts.for_jobs())
 
     # ---- the right step
 
@@ -233,8 +249,10 @@ class TextWorld:
         target = action.object_id
         if target is not None:
             place = self._place(target)
-            if place is None:
+            if place is None or (action.amount is not None and self._rng.random() < _NO_POSE):
                 return FailureCode.NO_FREE_POSE
+            if self._rng.random() < _BLOCKED:
+                return FailureCode.BLOCKED_PATH
             if place == self._at and self._awkward and (action.bearing_deg or action.amount):  # the plain stance is the old one
                 self._approaches += 1
                 self._awkward.clear()
@@ -242,6 +260,8 @@ class TextWorld:
         elif action.name in _LEGS:
             change = action.given_amount * (1 if action.name == "MoveUp" else -1)
             if not _LOWEST_M <= self._height_m + change <= _HIGHEST_M:
+                self._height_m = _HIGHEST_M if change > 0 else _LOWEST_M
+                self._awkward.clear()
                 return FailureCode.HEIGHT_LIMIT
             self._height_m += change
             self._told = False

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-__all__ = ["TEMPLATES", "natural_name", "phrase", "plural", "preposition", "shuffled", "wordings"]
+__all__ = ["ORDINALS", "TEMPLATES", "natural_name", "phrase", "plural", "preposition", "shuffled", "wordings"]
 
 _SPECIAL: Final[Mapping[str, str]] = {
     "TVStand": "TV stand",
@@ -29,7 +29,8 @@ _SPECIAL: Final[Mapping[str, str]] = {
     "SinkBasin": "sink",
     "WineBottle": "wine bottle",
 }
-_ORDINALS: Final = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth")
+#: How furniture of one type is counted.
+ORDINALS: Final = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth")
 
 _ENCLOSING: Final = frozenset(
     (
@@ -350,7 +351,7 @@ def phrase(object_id: str, scene: Mapping[str, str | None], furniture: frozenset
     if movable and [scene[other] for other in same].count(carrier) == 1:
         return f"the {name}{place}"
     rank = int(number) - 1
-    ordinal = _ORDINALS[rank] if rank < len(_ORDINALS) else number
+    ordinal = ORDINALS[rank] if rank < len(ORDINALS) else number
     return f"the {ordinal} {name}{place if located else ''}"
 
 

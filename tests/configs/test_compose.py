@@ -37,7 +37,7 @@ ALL = sorted(path.relative_to(CONFIG_DIR) for path in CONFIG_DIR.rglob("*.yaml")
 
 
 def test_count() -> None:
-    assert len(ALL) == 43, f"configs/ holds {len(ALL)} YAML files: {[str(path) for path in ALL]}"
+    assert len(ALL) == 44, f"configs/ holds {len(ALL)} YAML files: {[str(path) for path in ALL]}"
     assert set(groups()) == {*GROUP_ROOT, "contingency"}
 
 

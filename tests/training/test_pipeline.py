@@ -19,6 +19,7 @@ from configs.schema.train import TrainConfig
 from configs.validate import ConfigError, build
 from data.interface.observation import Camera, Observation, Proprioception
 from data.shards import ShardError, ShardReader, ShardWriter
+from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.building import add_adapter, load_model
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.training import release
@@ -94,7 +95,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
     small = dataclasses.replace(cfg, model=_small(cfg.model))
     (root / "tiny").mkdir()
     shutil.copytree(shards, root / "tiny" / "data")
-    pipeline = Pipeline(STAGES, small, collect, "python train.py stage=all", correct)
+    pipeline = Pipeline(STAGES, small, collect, "python train.py stage=all", correct, Lessons())
     for stage in STAGES:
         assert pipeline.run(stage) is not None
     return pipeline
@@ -391,5 +392,5 @@ def test_a_stage_of_ones_own_is_one_class_and_one_entry(trained: Pipeline, tmp_p
     assert metrics is not None and metrics["rows"] > 0
     assert pipeline.run("counting") is None
     assert pipeline.run("base") is None
-    with pytest.raises(ValueError, match=r"stage 'sleep' has no key; allowed: base, .*, counting"):
+    with pytest.raises(ValueError, match=r"stage 'sleep' has no key; allowed: words, base, .*, counting"):
         pipeline.key("sleep")

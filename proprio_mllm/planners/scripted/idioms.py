@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from proprio_mllm.planners.furniture import CONTAINERS
 from proprio_mllm.planners.scripted.words import Mention
 
 __all__ = ["INTO", "KIND_OF", "PREPOSITIONS", "Sentence", "read_sentence"]
@@ -119,15 +120,20 @@ def read_sentence(text: str, mentions: Sequence[Mention]) -> Sentence:
 def _located(text: str, mentions: list[Mention]) -> str:
     """Takes `from the side table` into the phrase before it; vessels that are poured from are no places."""
     pouring = re.search(r"\b(?:fill|filled|pour)\b", text) is not None
-    pattern = re.compile(r"<(\d+)> (?:from inside|out of|from|inside of|(?:that|which) (?:is|are) (?:on|in|at|inside)) <(\d+)>")
+    pattern = re.compile(
+        r"(?:<(\d+)> and )?<(\d+)> (?:from inside|out of|from|inside of|(?:that|which) (?:is|are) (?:on|in|at|inside)) <(\d+)>"
+    )
     at = 0
     while match := pattern.search(text, at):
-        obj, place = int(match[1]), int(match[2])
+        before, obj, place = match[1], int(match[2]), int(match[3])
         if pouring and mentions[place].name in _POURERS:
-            at = match.end(1)
+            at = match.end(2)
             continue
         mentions[obj] = replace(mentions[obj], place=mentions[place])
-        text = f"{text[: match.start()]}<{obj}>{text[match.end() :]}"
+        # what is shut away is said of both; what stands somewhere, of the last thing alone
+        if before is not None and mentions[place].name in CONTAINERS and mentions[int(before)].place is None:
+            mentions[int(before)] = replace(mentions[int(before)], place=mentions[place])
+        text = f"{text[: match.start(2) - 1]}<{obj}>{text[match.end() :]}"
     return text
 
 

@@ -182,21 +182,28 @@ class _Reader:
         for goal in [g for g in kept if g.kind == "filled" and g.tool is not None and self.said.in_hands]:
             assert goal.tool is not None
             kept += [Goal("held", goal.obj), Goal("held", goal.tool)]
+        spots = {g.obj: g.place for g in kept if g.kind == "on"}
+        kept = [replace(g, place=spots[g.obj]) if g.kind == "cooked" and not g.place and g.obj in spots else g for g in kept]
         kept += [Goal("on", g.obj, g.place) for g in kept if g.kind == "cooked" and g.place and g.obj not in put]
         if self.said.level:
             kept += [Goal("filled", g.obj) for g in kept if g.kind == "on"]
         if self.said.ajar:
-            kept += self._falls_shut(kept)
+            kept = self._behind_door(kept)
         if not goals and self.verb == "on":  # bring it, to nowhere in particular
             kept += [Goal("held", obj) for obj in self.objs]
         return tuple(dict.fromkeys(kept))
 
-    def _falls_shut(self, goals: list[Goal]) -> list[Goal]:
+    def _behind_door(self, goals: list[Goal]) -> list[Goal]:
+        """With the door that shuts by itself closed in the end; what is taken, and said to be nowhere else, is behind it."""
         for goal in goals:
             door = goal.place if goal.kind == "on" else self.said.door or goal.obj.place or self.place
             if door is not None:
-                return [Goal("closed", door, ajar=True)]
-        return []
+                inside = [
+                    replace(one, obj=replace(one.obj, place=door)) if one.kind == "held" and one.obj.place is None else one
+                    for one in goals
+                ]
+                return [*inside, Goal("closed", door, ajar=True)]
+        return goals
 
 
 def _merged(group: list[Mention]) -> list[Mention]:

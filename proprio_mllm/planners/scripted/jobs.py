@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Final
 
 from data.interface.actions import ACTIONS, ActionKind, bringing_about
+from data.interface.belief import Belief
 from data.interface.bodies import Arm
 from data.interface.effects import Condition
 from data.interface.steps import Action
-from proprio_mllm.planners.scripted.belief import Belief
 from proprio_mllm.planners.scripted.words import Mention, type_of
 
 __all__ = ["Job", "Want", "holds", "next_jobs"]
@@ -127,7 +127,7 @@ def next_jobs(wants: Sequence[Want], belief: Belief, known: Sequence[str]) -> li
     if len(held) != 1 or held[0].kind == "lifted" or len(belief.state.free_arms()) < 2:
         jobs += opening
     jobs += _carry(light, belief)
-    if not light:
+    if not moves:
         jobs += [_change(want) for want in pending if want.kind == "closed"]
     jobs = jobs or _heavy([want for want in moves if want not in light], belief)
     if not jobs or (len(jobs) == 1 and jobs[0].verb in ("ToggleOn", "ToggleOff", "Open", "Pick")):

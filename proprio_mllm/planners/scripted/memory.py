@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-
+from data.interface.belief import Belief
 from data.interface.effects import Condition
 from data.interface.failures import FailureCode
-from data.interface.observation import Observation
+from data.interface.sightings import Sightings
 from data.interface.steps import Action
 from proprio_mllm.planners.furniture import CONTAINERS, SEATS, SURFACES
-from proprio_mllm.planners.scripted.belief import Belief
 from proprio_mllm.planners.scripted.words import Mention, candidates, type_of
 
 __all__ = ["Memory"]
@@ -29,34 +27,21 @@ _PATIENCE: Final = 4
 class Memory:
     """What an episode has shown.
 
-    Args:
-        rng: decides the order of equally likely places.
-
     Attributes:
-        belief: the newest belief.
+        seen: what has been seen when, and the newest belief.
     """
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.belief = Belief()
-        self._rng = rng
-        self._known: tuple[str, ...] = ()
-        self._visible: tuple[str, ...] = ()
-        self._found_at: dict[str, str | None] = {}
+    def __init__(self) -> None:
+        self.seen = Sightings()
         self._meant: dict[tuple[Mention, int], str] = {}
         self._tried: Action | None = None
         self._blocked_before = self._blocked_then = 0
         self._ways: dict[Mention, list[Action]] = {}
 
-    def look(self, observation: Observation) -> None:
-        """Takes in what is known and in view, and where the robot was when it first was."""
-        self._known, self._visible = observation.known_objects, observation.visible_objects
-        here = None
-        for item in reversed(observation.history):
-            if item.step.startswith("GoTo(") and item.feedback.endswith(" ok"):
-                here = item.step[len("GoTo(") :].split(",")[0].rstrip(")")
-                break
-        for name in self._known:
-            self._found_at.setdefault(name, here)
+    @property
+    def belief(self) -> Belief:
+        """What the log says."""
+        return self.seen.belief
 
     def find(self, mention: Mention, index: int = 0) -> str | None:
         """The id that a phrase means, None when nothing that fits has been seen; once chosen it stays."""
@@ -65,10 +50,10 @@ class Memory:
             del self._meant[key]
         if key not in self._meant:
             taken = {name for (other, _), name in self._meant.items() if other == mention}
-            fitting = [name for name in candidates(mention, self._known) if name not in taken | self.belief.broken]
+            fitting = [name for name in candidates(mention, self.seen.known) if name not in taken | self.belief.broken]
             if mention.place is not None and fitting:
                 fitting = self._at_place(fitting, mention)
-            fitting.sort(key=lambda name: name not in self._visible)
+            fitting.sort(key=lambda name: name not in self.seen.visible)
             if not fitting:
                 return None
             self._meant[key] = fitting[0]
@@ -80,16 +65,16 @@ class Memory:
         place = self.find(mention.place)
         if place is None or place not in self.belief.visited:
             return fitting if place is None else []
-        found = [name for name in fitting if self._found_at.get(name) == place]
-        return found or [name for name in fitting if name in self._visible]
+        found = [name for name in fitting if self.seen.found_at.get(name) == place]
+        return found or [name for name in fitting if name in self.seen.visible]
 
     def is_near(self, target: str, place: str | None) -> bool:
         """Whether the robot went to a thing, or to what it stands on, last."""
         here = self.belief.state.here
         if here is None:
             return False
-        where = self.belief.state.at.get(target, place if place is not None else self._found_at.get(target))
-        return here == target or (here == where and here in self.belief.visited and target in self._visible)
+        where = self.belief.state.at.get(target, place if place is not None else self.seen.found_at.get(target))
+        return here == target or (here == where and here in self.belief.visited and target in self.seen.visible)
 
     def search(self, mention: Mention | None) -> Action:
         """The next step of looking for something: to the place that was named, then from furniture to furniture."""
@@ -121,8 +106,7 @@ class Memory:
         named = None if mention.place is None else self.find(mention.place)
         order: list[str] = [] if named is None else [named]
         for group in (SURFACES, SEATS, CONTAINERS):
-            names = sorted(name for name in self._known if type_of(name) in group and name != named)
-            order += [names[int(index)] for index in self._rng.permutation(len(names))]
+            order += [name for name in self.seen.known if type_of(name) in group and name != named]
         steps = [] if named is not None else [Action("MoveUp", amount=0.2), *[Action("RotateLeft", amount=90.0)] * 3]
         for name in order:
             steps.append(Action("GoTo", object_id=name))

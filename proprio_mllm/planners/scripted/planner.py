@@ -16,13 +16,14 @@ from typing import Final
 import numpy as np
 
 from data.interface.actions import ACTIONS, ActionKind
+from data.interface.belief import Belief
 from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
+from data.interface.sightings import Seen
 from data.interface.steps import Action, PlanStep
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
-from proprio_mllm.planners.scripted.belief import Belief
 from proprio_mllm.planners.scripted.instruction import TOOLS, Goal, read_goals
 from proprio_mllm.planners.scripted.jobs import Job, Want, next_jobs
 from proprio_mllm.planners.scripted.memory import Memory
@@ -43,6 +44,8 @@ _ASIDE_NAMES: Final = ("MoveBack", "MoveRight", "MoveLeft")
 _PATIENCE: Final = 16
 #: Codes after which the same thing may work when it is tried again.
 _BAD_LUCK: Final = (FailureCode.NOTHING_HAPPENED, FailureCode.LOCKED, FailureCode.SLIPPED, FailureCode.SPILLED)
+#: Codes after which the other arm may do what one could not.
+_ARM_SPECIFIC: Final = (FailureCode.OBSTRUCTED, FailureCode.GRASP_MISSED, FailureCode.HANDLE_SLIPPED)
 #: Codes that a better knowledge of the world answers: what comes next is another job.
 _KNOWLEDGE: Final = (
     FailureCode.ALREADY_IN_STATE,
@@ -71,43 +74,53 @@ class ScriptedPlanner:
 
     def __init__(self, image_size: int = 112) -> None:
         self.image_size = image_size
-        self._memory = Memory(np.random.default_rng(0))
+        self._memory = Memory()
         self._goals: tuple[Goal, ...] | None = None
 
     def reset(self, task: TaskInfo, rng: np.random.Generator) -> None:
-        """Forgets the last episode; `rng` decides the order in which unnamed furniture is searched."""
-        self._memory = Memory(rng)
+        """Forgets the last episode; nothing is drawn."""
+        self._memory = Memory()
         self._goals = None
 
     def step(self, observation: Observation, feedback: Feedback | None) -> PlannerReply:
         """The next step of the rules; what happened before is in the observation's history."""
         started = time.perf_counter()
-        step = self._plan(observation)
+        step, _ = self.decide(observation)
         return PlannerReply(step.to_text(), step, latency_s=time.perf_counter() - started)
 
-    def _plan(self, observation: Observation) -> PlanStep:
-        memory = self._memory
+    def decide(self, seen: Seen) -> tuple[PlanStep, Job | None]:
+        """The next step, and the job that it serves; None when nothing is left that can be done."""
         if self._goals is None:
-            self._goals = read_goals(observation.instruction, observation.known_objects)
-        memory.look(observation)
+            self._goals = read_goals(seen.instruction, seen.known_objects)
+        memory = self._memory
+        memory.seen.known = seen.known_objects  # names are looked up before the log is read
         doors = [memory.find(goal.obj) for goal in self._goals if goal.ajar]
-        belief = memory.belief = Belief.of(observation.history, [door for door in doors if door is not None])
-        jobs = next_jobs(self._wants(belief), belief, observation.known_objects)
+        memory.seen.look(seen, [door for door in doors if door is not None])
+        belief = memory.belief
+        jobs = next_jobs(self._wants(belief), belief, seen.known_objects)
         jobs = [job for job in jobs if not self._given_up(job, belief)]
         if not jobs:
-            return PlanStep((Action("Done"),))
+            return PlanStep((Action("Done"),)), None
+        step = self._towards(jobs, belief, seen)
+        door = belief.holds_furniture()
+        if door is not None and step.actions[0].spec.kind is ActionKind.BODY:  # a hand at a door keeps the robot where it is
+            step = PlanStep((Action("Release", arm=door),))
+        return step, None if step.actions[0].name == "Done" else jobs[0]
+
+    def _towards(self, jobs: Sequence[Job], belief: Belief, seen: Seen) -> PlanStep:
+        """The step that brings the first job forward."""
         head = jobs[0]
         freed = self._get_free(belief)
         if freed is not None:
             return PlanStep((freed,))
         if head.target is None:
-            return PlanStep((memory.search(head.spoken),))
+            return PlanStep((self._memory.search(head.spoken),))
         if head.target == "":
             return PlanStep((head.action(head.arm),))
         moved = self._approach(head, belief)
         if moved is not None:
             return PlanStep((moved,))
-        return self._act(head, jobs[1:], belief, observation)
+        return self._act(head, jobs[1:], belief, seen)
 
     # ---- goals
 
@@ -139,7 +152,7 @@ class ScriptedPlanner:
     def _get_free(self, belief: Belief) -> Action | None:
         """A step aside when a way is blocked, a rise of what both hands carry; None when nothing is in the way."""
         if belief.state.lifted is not None and belief.lowered_m > 0.02 and not belief.at_limit and self._just("Lift", belief):
-            return Action("MoveUp", amount=round(min(1.0, belief.lowered_m), 2))
+            return Action("MoveUp", amount=max(0.05, round(min(1.0, belief.lowered_m) / 0.05) * 0.05))
         if not belief.last or belief.last[0].code != FailureCode.BLOCKED_PATH:
             return None
         walking = belief.last[0].action.name == "GoTo"
@@ -175,8 +188,8 @@ class ScriptedPlanner:
             and True not in belief.at_limit
         ):
             return Action("MoveUp", amount=_RISES_M[0])  # over the edge
-        if last.code in (FailureCode.OBSTRUCTED, FailureCode.GRASP_MISSED, FailureCode.HANDLE_SLIPPED) and job.arm is None:
-            arms = {event.action.arm for event in failed if event.code == last.code}
+        if last.code in _ARM_SPECIFIC and last.action.arm is not None and job.arm is None:
+            arms = {event.action.arm for event in failed if event.code in _ARM_SPECIFIC}
             if len(arms) == 1 and len(belief.state.free_arms()) == 2:
                 return None  # the other arm may
         return self._stance(job, belief)
@@ -186,9 +199,13 @@ class ScriptedPlanner:
         events = belief.last
         if events and events[0].about("GoTo", job.target) and not events[0].ok:
             return self._stance(job, belief)
+        if events and events[0].action.name == "Release" and belief.let_shut.get(job.target or ""):
+            return self._stance(job, belief)
         if events and events[0].action.name in _ASIDE_NAMES:
             return Action("GoTo", object_id=job.target)
         near = belief.state.here == job.target if job.verb == "Lift" else self._memory.is_near(job.target or "", job.place)
+        if not failed and job.target in belief.too_far:
+            near = False
         return None if failed or near else Action("GoTo", object_id=job.target)
 
     def _height(self, job: Job, belief: Belief, up: bool) -> Action:
@@ -203,12 +220,13 @@ class ScriptedPlanner:
     def _stance(self, job: Job, belief: Belief) -> Action:
         target = job.target
         assert target is not None
-        distance, bearing = _STANCES[belief.stances.get(target, 0) % len(_STANCES)]
+        tried = belief.stances.get(target, 0) + belief.let_shut.get(target, 0)
+        distance, bearing = _STANCES[tried % len(_STANCES)]
         return Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
 
     # ---- the arms
 
-    def _act(self, head: Job, others: Sequence[Job], belief: Belief, observation: Observation) -> PlanStep:
+    def _act(self, head: Job, others: Sequence[Job], belief: Belief, seen: Seen) -> PlanStep:
         """The head job, with one for the other arm beside it where both may be done from here."""
         if ACTIONS[head.verb].kind is not ActionKind.ARM:
             return PlanStep((head.action(None),))
@@ -221,8 +239,8 @@ class ScriptedPlanner:
                 continue
             if job.target == head.target and not head.verb == job.verb == "Place":
                 continue
-            seen = job.target in observation.visible_objects or self._memory.is_near(job.target or "", job.place)
-            if seen and not belief.failures(job.verb, job.target):
+            in_view = job.target in seen.visible_objects or self._memory.is_near(job.target or "", job.place)
+            if in_view and not belief.failures(job.verb, job.target):
                 return PlanStep((first, job.action(arm.other)))
         return PlanStep((first,))
 
@@ -230,6 +248,8 @@ class ScriptedPlanner:
         """The free arm on the side where the target should be; the other one after a failure that an arm can be blamed for."""
         free = belief.state.free_arms() or (Arm.RIGHT,)
         side = Arm.LEFT if belief.bearing_deg > 0 else Arm.RIGHT
+        if belief.let_shut.get(job.target or "", 0) % 2:
+            side = side.other
         last = next((event for event in belief.last if event.about(job.verb, job.target)), None)
         if last is not None and not last.ok and last.action.arm is not None and last.code not in _BAD_LUCK:
             side = last.action.arm.other

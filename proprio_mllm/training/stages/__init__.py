@@ -15,10 +15,12 @@ from proprio_mllm.training.stages.dagger import DaggerStage
 from proprio_mllm.training.stages.pointmap import PointMapStage
 from proprio_mllm.training.stages.selu import SeluStage
 from proprio_mllm.training.stages.tokenizer import TokenizerStage
+from proprio_mllm.training.stages.words import WordsStage
 
 __all__ = ["STAGES"]
 
 STAGES: Final[Mapping[str, Stage]] = {
+    "words": WordsStage(),
     "base": BaseStage(),
     "dagger": DaggerStage(),
     "pointmap": PointMapStage(),

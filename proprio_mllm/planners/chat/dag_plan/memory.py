@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections import Counter
 
+from data.interface.belief import Belief
 from data.interface.bodies import Arm
 from data.interface.observation import Observation
 from proprio_mllm.planners.chat.dag_plan.hands import ARMS, Hands
-from proprio_mllm.planners.scripted.belief import Belief
 
 __all__ = ["Memory"]
 

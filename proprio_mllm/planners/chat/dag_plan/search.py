@@ -11,11 +11,11 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Final
 
+from data.interface.belief import Belief
 from data.interface.bodies import Arm
 from data.interface.effects import Condition
 from data.interface.steps import Action
 from proprio_mllm.planners.furniture import CONTAINERS, SEATS, SURFACES
-from proprio_mllm.planners.scripted.belief import Belief
 from proprio_mllm.planners.scripted.words import candidates, find_mentions, type_of
 
 __all__ = ["Search"]

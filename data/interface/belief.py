@@ -64,6 +64,8 @@ class Belief:
         lowered_m: how much lower the pelvis is than at the start, as far as it was asked to.
         bearing_deg: bearing that the last GoTo asked for.
         blocked: walks that were blocked since one succeeded.
+        too_far: what was out of reach from the present stance.
+        let_shut: how often a door that falls shut was let go of, by door.
         last: events of the newest step.
     """
 
@@ -82,6 +84,8 @@ class Belief:
     lowered_m: float = 0.0
     bearing_deg: float = 0.0
     blocked: int = 0
+    too_far: set[str] = field(default_factory=set)
+    let_shut: dict[str, int] = field(default_factory=dict)
     last: tuple[Event, ...] = ()
     _opened: tuple[Arm, str] | None = None
 
@@ -94,6 +98,7 @@ class Belief:
             self_closing: doors of which the instruction says that they fall shut.
         """
         belief = Belief(SymbolicState(self_closing=set(self_closing)))
+        belief.state.conditions[Condition.OPEN] |= dict.fromkeys(self_closing, False)
         for events in events_of(history):
             for event in sorted(events, key=lambda event: not event.ok):  # a success forgets failures, but not its own step's
                 belief._take(event)
@@ -105,7 +110,9 @@ class Belief:
         return next((arm for arm, item in self.state.held.items() if item in self.state.self_closing), None)
 
     def done(self, kind: str, object_id: str) -> bool:
-        """Whether an object is known to have been sliced, cleaned, used up or filled."""
+        """Whether an object is known to have been sliced, cleaned, used up or filled; whether food is done nobody tells."""
+        if kind not in _DONE:
+            return False
         condition, value = _DONE[kind]
         return self.state.is_in(condition, object_id) is value
 
@@ -120,6 +127,7 @@ class Belief:
                 self.stances[target] = self.stances.get(target, 0) + 1
                 self.bearing_deg = action.bearing_deg or 0.0
             self.heights.clear()
+            self.too_far.clear()
             self.blocked += event.code == FailureCode.BLOCKED_PATH
         elif action.spec.has_effect(Rise) and event.code in ("ok", FailureCode.HEIGHT_LIMIT):  # at the limit a part was done
             rise_m = sum(effect.sign for effect in action.spec.effects if isinstance(effect, Rise)) * action.given_amount
@@ -136,6 +144,9 @@ class Belief:
         self._failed(action, target, event.code)
 
     def _succeeded(self, action: Action, target: str) -> None:
+        held = None if action.arm is None else self.state.held[action.arm]
+        if action.name == "Release" and held is not None and held in self.state.self_closing:
+            self.let_shut[held] = self.let_shut.get(held, 0) + 1
         self.state.succeed(action)
         if action.spec.has_effect(Walk, Turn) and action.object_id is not None:
             self.visited.add(target)
@@ -153,6 +164,8 @@ class Belief:
         arm, state = action.arm, self.state
         if code in (FailureCode.ALREADY_IN_STATE, FailureCode.NOT_DIRTY):
             state.settle(action)
+        elif code == FailureCode.TOO_FAR:
+            self.too_far.add(target)
         elif code in _LOST_HOLD and action.spec.has_effect(Grasp, PutDown):
             state.lifted = None if arm is None else state.lifted
             if arm is not None:

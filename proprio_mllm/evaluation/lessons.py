@@ -1,0 +1,218 @@
+"""Lessons: whole episodes in words with a teacher's answer at every step, right or wrong steps taken.
+
+The teacher is the scripted planner: what it answers is a function of what it is shown, in the text world as in the simulator,
+so a model that sees the same can learn it. Part of the steps that are taken are mistakes; the teacher's answer to what follows
+from them is what is learnt. In half of the episodes some object types bear made-up names, in the instruction and in their ids,
+so that things are named by reading and not by heart.
+
+This is the bridge that `train.py` wires: training asks for the episode of a seed and knows neither worlds nor planners.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from data.interface.actions import ACTIONS
+from data.interface.bodies import PAPER_ROBOTS
+from data.interface.failures import FAILURES
+from data.interface.observation import HistoryItem
+from data.interface.sightings import Sightings
+from data.interface.steps import Action, PlanStep
+from proprio_mllm.model.wording import (
+    ID_NUMBERS,
+    MARKERS,
+    WordEpisode,
+    WordTurn,
+    answer_words,
+    id_words,
+    log_words,
+    number_words,
+    prefix_words,
+    state_words,
+    text_words,
+)
+from proprio_mllm.planners.scripted.planner import ScriptedPlanner
+from sim.collection.text_planning import draw_task
+from sim.collection.text_world import TextWorld
+from sim.robots.spec import load_robot
+from sim.scene.catalogue import load_catalogue
+from sim.tasks.instructions import ORDINALS, TEMPLATES, natural_name, plural
+from sim.tasks.sample import TRAIN_ROOMS, rng_for
+
+__all__ = ["Lessons", "lesson_in_words", "lesson_words"]
+
+#: Shares of steps that are mistakes, one drawn per episode.
+_MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
+_MAX_STEPS: Final = 40
+_RENAMED: Final = 0.5
+_MOST_RENAMED: Final = 5
+_SYLLABLES: Final = ("ba", "do", "fi", "gu", "ka", "lo", "mi", "nu", "pe", "ra", "so", "tu", "va", "wo", "xi", "zu")
+#: Numbers of instructions; counts of things.
+_COUNTS: Final = ("two", "three", "four")
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """The words of an observation."""
+
+    instruction: str
+    robot: str
+    visible_objects: tuple[str, ...]
+    known_objects: tuple[str, ...]
+    history: tuple[HistoryItem, ...] = ()
+
+
+class Lessons:
+    """The source of episodes that `train.py` hands to training.
+
+    Args:
+        robots: robots that act in them.
+    """
+
+    def __init__(self, robots: Sequence[str] = PAPER_ROBOTS) -> None:
+        self._robots = tuple(robots)
+
+    def words(self) -> tuple[str, ...]:
+        """Every word of them, apart from made-up names."""
+        return lesson_words(self._robots)
+
+    def episode(self, seed: int) -> WordEpisode:
+        """The episode of a seed."""
+        return lesson_in_words(seed, robots=self._robots)
+
+
+def lesson_words(robots: Sequence[str] = PAPER_ROBOTS) -> tuple[str, ...]:
+    """Every word of the sequences: markers, the grammar of actions, all types of the catalogue, all wordings of tasks."""
+    types = list(load_catalogue().types)
+    names = [word for name in types for word in (*id_words(f"{name}_1")[:-1], *text_words(natural_name(name)))]
+    spoken = [
+        word for sentences in TEMPLATES.values() for text in sentences for word in text_words(re.sub(r"\{\w+\}", " ", text))
+    ]
+    other = [*ORDINALS, *_COUNTS, "a", "an", "the", "in", "on", "from", "off"]
+    codes = [str(code) for code in FAILURES]
+    words = (*MARKERS, *robots, *ACTIONS, *codes, *ID_NUMBERS, *number_words(), *names, *spoken, *other)
+    return tuple(dict.fromkeys(words))
+
+
+def lesson_in_words(seed: int, rooms: Sequence[str] = TRAIN_ROOMS, robots: Sequence[str] = PAPER_ROBOTS) -> WordEpisode:
+    """An episode of the text world.
+
+    Args:
+        seed: names every draw.
+        rooms: rooms that half of the episodes are in; the others are in made-up ones.
+        robots: robots, one drawn.
+    """
+    rng = rng_for("lesson in words", seed)
+    draft, scene = draw_task(rooms, rng)
+    robot = str(rng.choice(robots))
+    world = TextWorld(draft, scene, load_robot(robot), rng)
+    hidden = [name for name in draft.objects if name not in world.seen]
+    instruction = draft.sentences(scene.furniture, rng, hidden)[0]
+    order = list(rng.permutation(len(scene.furniture)))
+    furniture = tuple(scene.furniture[int(index)] for index in order)
+    teacher, record = ScriptedPlanner(), _Record(_new_names(draft.objects, scene.furniture, rng))
+    mistakes = float(rng.choice(_MISTAKES))
+    history: list[HistoryItem] = []
+    while len(history) < _MAX_STEPS:
+        known = (*furniture, *(name for name in world.facts.objs if name in world.seen))
+        shown = _Shown(instruction, robot, tuple(world.visible), known, tuple(history))
+        if world.done():
+            record.look(shown, PlanStep((Action("Done"),)), "Done", "")
+            break
+        step, job = teacher.decide(shown)
+        if job is None:  # it gives up
+            break
+        record.look(shown, step, job.verb, job.target)
+        taken = world.mistake(step) if rng.random() < mistakes else step
+        outcomes = world.take(taken)
+        feedback = "; ".join(f"{action.to_text()} {code}" for action, code in outcomes)
+        history.append(HistoryItem(taken.to_text(), feedback))
+    return record.episode()
+
+
+class _Record:
+    """Writes an episode down in words, under other names where wanted."""
+
+    def __init__(self, names: Mapping[str, str]) -> None:
+        self._names = names
+        self._sightings = Sightings()
+        self._prefix: tuple[str, ...] = ()
+        self._turns: list[WordTurn] = []
+
+    def look(self, shown: _Shown, step: PlanStep, verb: str, target: str | None) -> None:
+        """A moment and the teacher's answer."""
+        shown = self._renamed(shown)
+        self._sightings.look(shown)
+        if not self._turns:
+            self._prefix = prefix_words(shown)
+        else:
+            taken = log_words(shown.history[-1], self._sightings.new)
+            self._turns[-1] = replace(self._turns[-1], taken=taken)
+        actions = tuple(
+            one if one.object_id is None else replace(one, object_id=self._id(one.object_id)) for one in step.actions
+        )
+        answer = answer_words(verb, self._id(target) if target else target, PlanStep(actions))
+        self._turns.append(WordTurn(state_words(self._sightings), answer, ()))
+
+    def episode(self) -> WordEpisode:
+        """What was written."""
+        return WordEpisode(self._prefix, tuple(self._turns))
+
+    def _id(self, object_id: str) -> str:
+        name, _, number = object_id.rpartition("_")
+        return f"{self._names.get(name, name)}_{number}"
+
+    def _renamed(self, shown: _Shown) -> _Shown:
+        if not self._names:
+            return shown
+        pattern, types = _names_pattern()
+
+        def other(match: re.Match[str]) -> str:
+            kind, many = types[match[0].lower()]
+            if kind not in self._names:
+                return match[0]
+            return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", self._names[kind]).lower() + ("s" if many else "")
+
+        history = tuple(HistoryItem(self._ids(item.step), self._ids(item.feedback)) for item in shown.history)
+        return _Shown(
+            pattern.sub(other, shown.instruction),
+            shown.robot,
+            tuple(map(self._id, shown.visible_objects)),
+            tuple(map(self._id, shown.known_objects)),
+            history,
+        )
+
+    def _ids(self, text: str) -> str:
+        return re.sub(r"[A-Za-z0-9]+_\d+", lambda match: self._id(match[0]), text)
+
+
+@functools.cache
+def _names_pattern() -> tuple[re.Pattern[str], dict[str, tuple[str, bool]]]:
+    """Finds the names of types in an instruction; the type of each name, and whether it is a plural."""
+    types: dict[str, tuple[str, bool]] = {}
+    for name in load_catalogue().types:
+        types[natural_name(name).lower()] = (name, False)
+        types[plural(name, 2).removeprefix("two ").lower()] = (name, True)
+    longest = sorted(types, key=len, reverse=True)
+    return re.compile(rf"\b(?:{'|'.join(longest)})\b", re.IGNORECASE), types
+
+
+def _new_names(objects: Mapping[str, str], furniture: Sequence[str], rng: np.random.Generator) -> dict[str, str]:
+    """Made-up names of some types, of one or two words; none in half of the episodes."""
+    if rng.random() >= _RENAMED:
+        return {}
+    types = list(dict.fromkeys(name.rsplit("_", 1)[0] for name in (*objects, *objects.values(), *furniture)))
+    weights = np.array([3.0 if any(name.startswith(f"{kind}_") for name in objects) else 1.0 for kind in types])
+    count = min(int(rng.integers(1, _MOST_RENAMED + 1)), len(types))
+    chosen = rng.choice(len(types), count, replace=False, p=weights / weights.sum())
+    return {types[int(index)]: "".join(_made_up_word(rng) for _ in range(int(rng.integers(1, 3)))) for index in chosen}
+
+
+def _made_up_word(rng: np.random.Generator) -> str:
+    return "".join(str(rng.choice(_SYLLABLES)) for _ in range(3)).capitalize()

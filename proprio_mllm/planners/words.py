@@ -1,0 +1,220 @@
+"""Plans with a model that reads whole episodes in words (`proprio_mllm.model.wording`).
+
+The episode's log is kept as it grows; before each answer comes the block of what is known now. Answers are held to the grammar
+of actions and to known ids, so no reply is invalid. A step that was refused twice from the same stance is not taken a third
+time: the model's second choice is.
+
+Paper: the language model of Proprio-MLLM before it sees and feels.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from data.interface.feedback import Feedback
+from data.interface.observation import Observation
+from data.interface.sightings import Sightings
+from data.interface.steps import PlanStep
+from data.interface.symbolic import events_of
+from proprio_mllm.model.building import load_model
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.word_tokens import WordTokens
+from proprio_mllm.model.wording import Words, log_words, prefix_words, read_step, state_words
+from proprio_mllm.planners.answers import AnswerGrammar
+from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights
+
+__all__ = ["WordsPlanner", "WordsState", "plans_in_words"]
+
+_LONGEST: Final = 40
+#: Refusals of a step from one stance after which another one is taken.
+_REFUSALS: Final = 2
+_CHOICES: Final = 4
+
+
+@dataclass(slots=True)
+class WordsState:
+    """One episode.
+
+    Attributes:
+        words: the episode's tokens.
+        generator: draws the tokens where a temperature asks for it.
+        sightings: what has been seen, and what the log says.
+        log: tokens of prefix and log.
+        refused: how often each step was refused since the last one that succeeded.
+    """
+
+    words: WordTokens
+    generator: torch.Generator
+    sightings: Sightings = field(default_factory=Sightings)
+    log: list[int] = field(default_factory=list)
+    refused: dict[str, int] = field(default_factory=dict)
+
+    def look(self, observation: Observation) -> list[int]:
+        """Takes in an observation; the tokens that stand before the answer."""
+        self.sightings.look(observation)
+        if not self.log:
+            self.log = self.words.tokens(prefix_words(observation))
+        elif observation.history:
+            self.log += self.words.tokens(log_words(observation.history[-1], self.sightings.new))
+            self._count(observation)
+        return self.log + self.words.tokens(state_words(self.sightings))
+
+    def _count(self, observation: Observation) -> None:
+        last = observation.history[-1]
+        if any(event.ok for events in events_of([last]) for event in events):
+            self.refused.clear()
+        else:
+            self.refused[last.step] = self.refused.get(last.step, 0) + 1
+
+
+class WordsPlanner:
+    """A model in this process.
+
+    Args:
+        model: trained by `stage=words`, in evaluation mode.
+        temperature: 0 takes the most likely word.
+        insist: whether steps that were refused twice may be repeated.
+    """
+
+    privileged = False
+    image_size = 0
+
+    def __init__(self, model: ProprioMLLM, temperature: float = 0.0, insist: bool = False) -> None:
+        self.model, self.temperature, self.insist = model, temperature, insist
+        self._tokenizer = model.processor.tokenizer
+        self._state: WordsState | None = None
+        self._pad = int(self._tokenizer.pad_token_id)
+
+    @staticmethod
+    def load(folder: str | Path, temperature: float = 0.0, train: str = "") -> WordsPlanner:
+        """Reads a stored model.
+
+        Raises:
+            WeightsError: when the folder has no model; the message names `train`, the command that makes it.
+        """
+        model = load_model(check_weights(folder, train))
+        return WordsPlanner(model.to("cuda") if torch.cuda.is_available() else model, temperature)
+
+    def begin(self, task: TaskInfo, rng: np.random.Generator) -> WordsState:
+        """The state of a new episode."""
+        return WordsState(WordTokens(self._tokenizer), torch.Generator().manual_seed(int(rng.integers(2**31))))
+
+    def reset(self, task: TaskInfo, rng: np.random.Generator) -> None:
+        """Forgets the last episode."""
+        self._state = self.begin(task, rng)
+
+    def step(self, observation: Observation, feedback: Feedback | None) -> PlannerReply:
+        """The model's next step; earlier feedback is in the observation's history."""
+        assert self._state is not None
+        return self.step_batch([observation], [self._state])[0]
+
+    def step_batch(self, observations: Sequence[Observation], states: Sequence[WordsState] | None = None) -> list[PlannerReply]:
+        """One reply per observation; the latency is the batch's, shared equally."""
+        assert states is not None
+        started = time.perf_counter()
+        prompts = [state.look(one) for one, state in zip(observations, states, strict=True)]
+        answers = [_Answer(AnswerGrammar(one.known_objects), state) for one, state in zip(observations, states, strict=True)]
+        open_rows = list(range(len(answers)))
+        for _ in range(_CHOICES):
+            self._write([prompts[row] for row in open_rows], [answers[row] for row in open_rows])
+            open_rows = [row for row in open_rows if not self.insist and answers[row].refused() and answers[row].reconsider()]
+            if not open_rows:
+                break
+        each_s = (time.perf_counter() - started) / len(answers)
+        replies: list[PlannerReply] = []
+        for prompt, answer in zip(prompts, answers, strict=True):
+            step = answer.step()
+            replies.append(PlannerReply(step.to_text(), step, tokens=len(prompt) + len(answer.words), latency_s=each_s))
+        return replies
+
+    @torch.no_grad()
+    def _write(self, prompts: Sequence[Sequence[int]], answers: Sequence[_Answer]) -> None:
+        """Continues every answer to its end."""
+        text: Any = self.model.core.model.language_model
+        head: Any = self.model.core.lm_head
+        rows = [[*prompt, *answer.tokens] for prompt, answer in zip(prompts, answers, strict=True)]
+        size = max(map(len, rows))
+        ids = torch.full((len(rows), size), self._pad)
+        mask = torch.zeros(len(rows), size, dtype=torch.long)
+        for number, row in enumerate(rows):
+            ids[number, size - len(row) :] = torch.tensor(row)
+            mask[number, size - len(row) :] = 1
+        ids, mask = ids.to(self.model.device), mask.to(self.model.device)
+        places = (mask.cumsum(1) - 1).clamp_min(0)
+        out = text(input_ids=ids, attention_mask=mask, position_ids=places, use_cache=True)
+        for _ in range(_LONGEST):
+            scores = head(out.last_hidden_state[:, -1]).float().cpu()  # (B, V)
+            tokens = [answer.choose(row, self.temperature) for answer, row in zip(answers, scores, strict=True)]
+            if all(token is None for token in tokens):
+                return
+            following = torch.tensor([[self._pad if token is None else token] for token in tokens], device=ids.device)
+            places = places[:, -1:] + 1
+            mask = torch.cat([mask, mask.new_ones(len(rows), 1)], 1)
+            out = text(
+                input_ids=following,
+                attention_mask=mask,
+                position_ids=places,
+                past_key_values=out.past_key_values,
+                use_cache=True,
+            )
+
+
+def plans_in_words(folder: str | Path) -> bool:
+    """Whether a stored model plans from whole episodes in words."""
+    path = Path(folder) / "config.json"
+    return path.is_file() and bool(json.loads(path.read_text(encoding="utf-8"))["config"].get("episodes", False))
+
+
+class _Answer:
+    """An answer under way: its words and tokens, and what else was likely at each of them."""
+
+    def __init__(self, grammar: AnswerGrammar, state: WordsState) -> None:
+        self._grammar, self._state = grammar, state
+        self.words: list[str] = []
+        self.tokens: list[int] = []
+        self._margins: list[float] = []
+        self._forbidden: dict[Words, set[str]] = {}
+
+    def choose(self, scores: Tensor, temperature: float) -> int | None:
+        """Takes the next word by the scores (V,) of tokens; its token, None when the answer has ended."""
+        options = [word for word in self._grammar.allowed(self.words) if word not in self._forbidden.get(tuple(self.words), ())]
+        if not options:
+            return None
+        tokens = [self._state.words.tokens([word])[0] for word in options]
+        values = scores[tokens]
+        if temperature > 0.0:
+            index = int(torch.multinomial((values / temperature).softmax(-1), 1, generator=self._state.generator))
+        else:
+            index = int(values.argmax())
+        others = values[torch.arange(len(options)) != index]
+        self._margins.append(float(values[index] - others.max()) if len(options) > 1 else float("inf"))
+        self.words.append(options[index])
+        self.tokens.append(tokens[index])
+        return tokens[index]
+
+    def step(self) -> PlanStep:
+        """The step of a finished answer."""
+        return read_step(self.words, self._grammar.ids)
+
+    def refused(self) -> bool:
+        """Whether this step was refused as often as it may be."""
+        return self._state.refused.get(self.step().to_text(), 0) >= _REFUSALS
+
+    def reconsider(self) -> bool:
+        """Goes back to the word of the step that was least certain, and rules it out; false where there was no other."""
+        first = self.words.index("do") + 1
+        place = min(range(first, len(self.words)), key=lambda index: self._margins[index])
+        if self._margins[place] == float("inf"):
+            return False
+        self._forbidden.setdefault(tuple(self.words[:place]), set()).add(self.words[place])
+        del self.words[place:], self.tokens[place:], self._margins[place:]
+        return True

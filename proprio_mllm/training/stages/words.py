@@ -1,0 +1,44 @@
+"""Stage `words`: the language model learns to plan from whole episodes in words, before it sees or feels anything."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from proprio_mllm.model.building import build_model, build_processor, save_model
+from proprio_mllm.model.word_tokens import add_word_tokens
+from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError, base_model_config
+from proprio_mllm.training.words import WordsObjective, held_out
+
+__all__ = ["WordsStage"]
+
+
+class WordsStage:
+    """One loop over episodes that are made as they are needed."""
+
+    name = "words"
+    needs = ()
+    shards = ()
+    recipe = 0
+
+    def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
+        """The loop and the plain backbone."""
+        model = dataclasses.asdict(base_model_config(pipeline.cfg.model))
+        return {"words": dataclasses.asdict(pipeline.cfg.words), "model": model}
+
+    def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
+        """Trains and stores the model; measures it on episodes that it was not trained on."""
+        if pipeline.lessons is None:
+            raise StageError("stage 'words' needs a source of lessons: run it with `python train.py stage=words`")
+        cfg = dataclasses.replace(base_model_config(pipeline.cfg.model), episodes=True)
+        words = pipeline.lessons.words()
+        processor = build_processor(cfg, [" ".join(words)] * 2)
+        add_word_tokens(processor.tokenizer, words)
+        model = build_model(cfg, processor, pipeline.cfg.seed)
+        model.requires_grad_(False)
+        model.core.model.language_model.requires_grad_(True)
+        pipeline.loop(WordsObjective(model, pipeline.lessons.episode, key), pipeline.cfg.words, folder / "loop")
+        save_model(model.eval(), pipeline.paths.model("words"))
+        return held_out(model, pipeline.lessons.episode)

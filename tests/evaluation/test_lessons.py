@@ -1,0 +1,71 @@
+"""Lessons: the teacher reaches the goals in words, names of things are copied and not remembered, nothing private is told."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from proprio_mllm.evaluation.lessons import Lessons
+from proprio_mllm.model.word_tokens import WordTokens, add_word_tokens
+from proprio_mllm.model.wording import id_words, text_words
+
+SEEDS = range(80)
+
+
+@pytest.fixture(scope="module")
+def episodes() -> list:
+    return [Lessons().episode(seed) for seed in SEEDS]
+
+
+def test_episodes_end_in_success(episodes: list) -> None:
+    done = [episode.turns[-1].answer[:1] == ("Done",) for episode in episodes]
+    assert np.mean(done) > 0.9
+
+
+def test_an_episode_is_a_function_of_its_seed(episodes: list) -> None:
+    assert Lessons().episode(5) == episodes[5]
+    assert episodes[5] != episodes[6]
+
+
+def test_every_word_is_known_or_made_up(episodes: list) -> None:
+    known = set(Lessons().words())
+    used = {word for one in episodes for turn in one.turns for word in (*one.prefix, *turn.now, *turn.answer, *turn.taken)}
+    plurals = {word for word in used - known if word.endswith("s") and (word[:-1] in known or word[:-2] in known)}
+    made_up = used - known - plurals - {"knives"}
+    assert all(re.fullmatch(r"(?:[a-z]{2}){3}s?", word) for word in made_up)
+    assert len(made_up) > 20
+
+
+def test_an_answer_names_what_was_shown(episodes: list) -> None:
+    for episode in episodes:
+        shown: set[str] = set(episode.prefix)
+        for turn in episode.turns:
+            shown |= set(turn.now)
+            named = [word for word in turn.answer if re.fullmatch(r"(?:[a-z]{2}){3}", word) and word not in Lessons().words()]
+            assert set(named) <= shown
+            shown |= set(turn.taken)
+
+
+def test_slots_are_the_same_in_instruction_and_ids() -> None:
+    class Tokenizer:
+        def __init__(self) -> None:
+            self.added: dict[str, int] = {}
+
+        def add_tokens(self, tokens: list) -> None:
+            for token in tokens:
+                self.added.setdefault(token.content, len(self.added))
+
+        def get_added_vocab(self) -> dict[str, int]:
+            return self.added
+
+    tokenizer = Tokenizer()
+    add_word_tokens(tokenizer, ["put", "two", "on", "the", "s", "_1", "knife", "box"])
+    words = WordTokens(tokenizer, np.random.default_rng(0))
+    put, two, zubo, ending = words.tokens(text_words("Put two zubos"))
+    assert words.tokens(id_words("Zubo_1"))[0] == zubo
+    assert words.tokens(["knives"]) == words.tokens(["knife", "s"])
+    assert words.tokens(["boxes"]) == words.tokens(["box", "s"])
+    assert len({put, two, zubo, ending}) == 4
+    assert words.tokens(["mika"]) != words.tokens(["zubo"])

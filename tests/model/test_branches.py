@@ -1,0 +1,73 @@
+"""Branches beside a log: each decision is predicted as if the log up to it and its own branch were all there is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from configs.compose import compose
+from configs.schema.train import TrainConfig
+from configs.validate import build
+from proprio_mllm.evaluation.lessons import Lessons
+from proprio_mllm.model.branches import with_branches
+from proprio_mllm.model.building import build_model, build_processor
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.word_tokens import WordTokens, add_word_tokens
+from proprio_mllm.training.pipeline import base_model_config
+from proprio_mllm.training.words import WordsObjective, collate, rows_of
+
+
+@pytest.fixture(scope="module")
+def model() -> ProprioMLLM:
+    cfg = base_model_config(build(TrainConfig, compose("train", ["stage=words"])).model)
+    words = Lessons().words()
+    processor = build_processor(cfg, [" ".join(words)] * 2)
+    add_word_tokens(processor.tokenizer, words)
+    return build_model(cfg, processor, 3).eval()
+
+
+def test_a_branch_reads_what_text_would(model: ProprioMLLM) -> None:
+    episode = Lessons().episode(7)
+    rows = rows_of(episode, WordTokens(model.processor.tokenizer))
+    text = model.core.model.language_model
+    for row in rows:
+        batch = collate([row], 0)
+        with torch.no_grad(), with_branches(text):
+            packed = text(
+                input_ids=batch.input_ids,
+                attention_mask={"full_attention": batch.layout},
+                position_ids=batch.position_ids,
+                use_cache=False,
+            )[0][0]
+        log, width = batch.layout.log, (batch.input_ids.shape[1] - batch.layout.log) // batch.layout.anchors.shape[1]
+        for index, (anchor, tokens, _) in enumerate(row.branches):
+            with torch.no_grad():
+                plain = text(input_ids=torch.tensor([[*row.log[:anchor], *tokens]]), use_cache=False)[0][0, anchor:]
+            start = log + index * width
+            torch.testing.assert_close(packed[start : start + len(tokens)], plain, atol=2e-5, rtol=1e-4)
+
+
+def test_every_learnt_decision_is_in_one_row(model: ProprioMLLM) -> None:
+    episode = Lessons().episode(11)
+    words = WordTokens(model.processor.tokenizer)
+    branches = [branch for row in rows_of(episode, words) for branch in row.branches]
+    expected = [words.tokens((*turn.now, *turn.answer)) for turn in episode.turns]
+    assert sorted(tokens for _, tokens, _ in branches) == sorted(tokens for tokens in expected if len(tokens) <= 72)
+    assert len(branches) > 2
+
+
+def test_only_answers_are_learnt(model: ProprioMLLM) -> None:
+    objective = WordsObjective(model, Lessons().episode, "")
+    for part in objective.batch(np.random.default_rng(0), 6):
+        for ids, labels in zip(part.input_ids, part.labels, strict=True):
+            places = (labels != -100).nonzero()[:, 0]
+            assert bool((places >= part.layout.log).all())
+            assert torch.equal(labels[places], ids[places + 1])
+
+
+def test_the_batch_depends_on_its_generator_alone(model: ProprioMLLM) -> None:
+    objective = WordsObjective(model, Lessons().episode, "")
+    one, two, other = (objective.batch(np.random.default_rng(seed), 4) for seed in (1, 1, 2))
+    assert all(torch.equal(a.input_ids, b.input_ids) for a, b in zip(one, two, strict=True))
+    assert one[0].input_ids.shape != other[0].input_ids.shape or not torch.equal(one[0].input_ids, other[0].input_ids)

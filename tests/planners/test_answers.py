@@ -1,0 +1,61 @@
+"""The grammar of answers: every step can be said, nothing else can."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from data.interface.actions import ACTIONS
+from data.interface.steps import PlanStep
+from proprio_mllm.model.wording import END, answer_words, read_step
+from proprio_mllm.planners.answers import AnswerGrammar
+
+IDS = ("DiningTable_1", "DiningTable_2", "Mug_1", "TVStand_1", "Fridge_1", "Zubo_1")
+STEPS = (
+    "Pick(left, Mug_1) & Open(right, Fridge_1)",
+    "GoTo(DiningTable_2, auto, -20)",
+    "GoTo(TVStand_1, 0.5)",
+    "MoveUp(0.15)",
+    "RotateLeft(90)",
+    "Release(left)",
+    "Place(right, Zubo_1) & Place(left, Zubo_1)",
+    "Lift(Mug_1)",
+    "Done()",
+)
+
+
+def said(words: tuple[str, ...], grammar: AnswerGrammar) -> bool:
+    return all(word in grammar.allowed(words[:number]) for number, word in enumerate(words))
+
+
+@pytest.mark.parametrize("text", STEPS)
+def test_every_step_can_be_said_and_is_read_back(text: str) -> None:
+    step, grammar = PlanStep.parse(text), AnswerGrammar(IDS)
+    words = answer_words("Pick", "Mug_1", step)
+    assert said(words, grammar)
+    assert grammar.allowed(words) == []
+    assert read_step(words, grammar.ids) == step
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Pick(left, DiningTable_1)",  # furniture
+        "Pick(left, Mug_1) & Pick(right, Mug_1)",  # one thing for two arms
+        "GoTo(Mug_2)",  # not known
+    ],
+)
+def test_what_cannot_be_done_cannot_be_said(text: str) -> None:
+    assert not said(answer_words("Pick", "Mug_1", PlanStep.parse(text)), AnswerGrammar(IDS))
+
+
+def test_whatever_is_said_is_a_step() -> None:
+    rng, grammar = np.random.default_rng(0), AnswerGrammar(IDS)
+    seen: set[str] = set()
+    for _ in range(400):
+        words: list[str] = []
+        while options := grammar.allowed(words):
+            words.append(options[int(rng.integers(len(options)))])
+        assert words[-1] == END
+        seen |= {action.name for action in read_step(words, grammar.ids).actions}
+    assert seen == set(ACTIONS)
