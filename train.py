@@ -1,8 +1,8 @@
 """Trains Proprio-MLLM: `python train.py stage=all model=tiny` (paper, three stages; `stage=base` stands in for pretraining).
 
-Stages: data (motions to clips shards), collect (views, planning in words, demonstrations), words (whole episodes in words),
-base, dagger (the base model acts, the expert corrects it), pointmap, tokenizer, alignment, selu; `all` runs them in order and
-skips what is current. Options are documented in configs/schema/train.py.
+Stages: data (motions to clips shards), collect (views, planning in words, demonstrations), base, dagger (the base model acts,
+the expert corrects it), pointmap, tokenizer, alignment, selu; `all` runs them in order and skips what is current. `words`
+(whole episodes in words) is run by its name: no other stage starts from it. Options are documented in configs/schema/train.py.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
     pipeline = Pipeline(
         STAGES, cfg, partial(_rollouts, robots=robots), command, partial(_dagger, robots=robots), Lessons(robots)
     )
-    wanted = tuple(STAGES) if cfg.stage == "all" else (cfg.stage,)
+    wanted = tuple(name for name in STAGES if name != "words") if cfg.stage == "all" else (cfg.stage,)
     metrics = {name: pipeline.run(name) for name in wanted}
     if cfg.release is not None:
         from proprio_mllm.training.release import export

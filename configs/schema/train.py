@@ -20,6 +20,7 @@ __all__ = [
     "StageName",
     "TrainConfig",
     "Variant",
+    "WordsConfig",
 ]
 
 #: Training tasks have 2^31 seeds, a million for each seed of a run.
@@ -50,6 +51,7 @@ class LoopConfig:
             results depend on the machine's speed. 0 means steps alone count.
         precision: `bf16` computes under autocast, parameters stay as they are.
         optimizer: `adamw`, or `muon` for the weights of linear layers with AdamW for the rest.
+        adam_share: with `muon`, AdamW's learning rate over Muon's.
     """
 
     steps: int
@@ -63,11 +65,13 @@ class LoopConfig:
     minutes: float = 0.0
     precision: Literal["fp32", "bf16"] = "fp32"
     optimizer: Literal["adamw", "muon"] = "adamw"
+    adam_share: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "checkpoint_every", "log_every"):
             require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
-        require(self.lr > 0.0, f"lr {self.lr} must be positive")
+        for name in ("lr", "adam_share"):
+            require(getattr(self, name) > 0.0, f"{name} {getattr(self, name)} must be positive")
         require(self.minutes >= 0.0, f"minutes {self.minutes} must not be negative")
 
 
@@ -96,6 +100,22 @@ class BaseConfig:
     def __post_init__(self) -> None:
         _require_shares(self, "plan_share", "text_share", "judge_share")
         require(self.questions > 0, f"questions {self.questions} must be positive")
+
+
+@dataclass(frozen=True)
+class WordsConfig:
+    """`stage=words`: whole episodes in words.
+
+    Attributes:
+        loop: an example is an episode.
+        reading: weight of predicting what is read, the log and the blocks before answers, beside the answers.
+    """
+
+    loop: LoopConfig
+    reading: float = 1.0
+
+    def __post_init__(self) -> None:
+        _require_shares(self, "reading")
 
 
 @dataclass(frozen=True)
@@ -221,7 +241,7 @@ class TrainConfig:
         variant: which ablation of the model. `no_proprio` trains on the same data without motion tokens, MPE and CSE: what the
             stages bring without proprioception.
         model: the model.
-        words: loop of `stage=words`; an example is a whole episode.
+        words: `stage=words`.
         output: folder of all outputs.
         seed: seed of data order, initial weights and rollouts.
         threads: torch threads; 0 leaves torch's choice.
@@ -241,7 +261,7 @@ class TrainConfig:
     tokenizer: LoopConfig
     alignment: AlignmentConfig
     selu: SeluConfig
-    words: LoopConfig
+    words: WordsConfig
     data: DataConfig = field(default_factory=DataConfig)
     collect: CollectStageConfig = field(default_factory=CollectStageConfig)
     dagger: DaggerConfig = field(default_factory=DaggerConfig)

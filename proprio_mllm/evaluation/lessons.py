@@ -45,7 +45,7 @@ from sim.scene.catalogue import load_catalogue
 from sim.tasks.instructions import ORDINALS, TEMPLATES, natural_name, plural
 from sim.tasks.sample import TRAIN_ROOMS, rng_for
 
-__all__ = ["Lessons", "lesson_in_words", "lesson_words"]
+__all__ = ["Lessons", "Shown", "WordsOnly", "lesson_in_words", "lesson_words"]
 
 #: Shares of steps that are mistakes, one drawn per episode.
 _MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
@@ -58,8 +58,8 @@ _COUNTS: Final = ("two", "three", "four")
 
 
 @dataclass(frozen=True, slots=True)
-class _Shown:
-    """The words of an observation."""
+class Shown:
+    """The words of an observation (`data.interface.sightings.Seen`)."""
 
     instruction: str
     robot: str
@@ -100,28 +100,57 @@ def lesson_words(robots: Sequence[str] = PAPER_ROBOTS) -> tuple[str, ...]:
     return tuple(dict.fromkeys(words))
 
 
-def lesson_in_words(seed: int, rooms: Sequence[str] = TRAIN_ROOMS, robots: Sequence[str] = PAPER_ROBOTS) -> WordEpisode:
-    """An episode of the text world.
+class WordsOnly:
+    """An episode of the text world under way.
 
     Args:
-        seed: names every draw.
+        seed: names every draw; negative ones are never trained on.
         rooms: rooms that half of the episodes are in; the others are in made-up ones.
         robots: robots, one drawn.
+
+    Attributes:
+        task: the draft.
+        world: what is so.
+        rng: draws of the world, and of whoever plays it.
+        robot: the robot.
     """
-    rng = rng_for("lesson in words", seed)
-    draft, scene = draw_task(rooms, rng)
-    robot = str(rng.choice(robots))
-    world = TextWorld(draft, scene, load_robot(robot), rng)
-    hidden = [name for name in draft.objects if name not in world.seen]
-    instruction = draft.sentences(scene.furniture, rng, hidden)[0]
-    order = list(rng.permutation(len(scene.furniture)))
-    furniture = tuple(scene.furniture[int(index)] for index in order)
-    teacher, record = ScriptedPlanner(), _Record(_new_names(draft.objects, scene.furniture, rng))
+
+    def __init__(self, seed: int, rooms: Sequence[str] = TRAIN_ROOMS, robots: Sequence[str] = PAPER_ROBOTS) -> None:
+        self.rng = rng_for("lesson in words", seed)
+        self.task, self.scene = draw_task(rooms, self.rng)
+        self.robot = str(self.rng.choice(robots))
+        self.world = TextWorld(self.task, self.scene, load_robot(self.robot), self.rng)
+        hidden = [name for name in self.task.objects if name not in self.world.seen]
+        self._instruction = self.task.sentences(self.scene.furniture, self.rng, hidden)[0]
+        order = self.rng.permutation(len(self.scene.furniture))
+        self._furniture = tuple(self.scene.furniture[int(index)] for index in order)
+        self._history: list[HistoryItem] = []
+
+    @property
+    def steps(self) -> int:
+        """Steps that were taken."""
+        return len(self._history)
+
+    def shown(self) -> Shown:
+        """What a planner sees."""
+        known = (*self._furniture, *(name for name in self.world.facts.objs if name in self.world.seen))
+        return Shown(self._instruction, self.robot, tuple(self.world.visible), known, tuple(self._history))
+
+    def take(self, step: PlanStep) -> None:
+        """Carries a step out."""
+        outcomes = self.world.take(step)
+        feedback = "; ".join(f"{action.to_text()} {code}" for action, code in outcomes)
+        self._history.append(HistoryItem(step.to_text(), feedback))
+
+
+def lesson_in_words(seed: int, robots: Sequence[str] = PAPER_ROBOTS) -> WordEpisode:
+    """An episode of the text world with the teacher's answers; some steps that are taken are mistakes."""
+    episode = WordsOnly(seed, robots=robots)
+    rng, world = episode.rng, episode.world
+    teacher, record = ScriptedPlanner(), _Record(_new_names(episode.task.objects, episode.scene.furniture, rng))
     mistakes = float(rng.choice(_MISTAKES))
-    history: list[HistoryItem] = []
-    while len(history) < _MAX_STEPS:
-        known = (*furniture, *(name for name in world.facts.objs if name in world.seen))
-        shown = _Shown(instruction, robot, tuple(world.visible), known, tuple(history))
+    while episode.steps < _MAX_STEPS:
+        shown = episode.shown()
         if world.done():
             record.look(shown, PlanStep((Action("Done"),)), "Done", "")
             break
@@ -129,10 +158,7 @@ def lesson_in_words(seed: int, rooms: Sequence[str] = TRAIN_ROOMS, robots: Seque
         if job is None:  # it gives up
             break
         record.look(shown, step, job.verb, job.target)
-        taken = world.mistake(step) if rng.random() < mistakes else step
-        outcomes = world.take(taken)
-        feedback = "; ".join(f"{action.to_text()} {code}" for action, code in outcomes)
-        history.append(HistoryItem(taken.to_text(), feedback))
+        episode.take(world.mistake(step) if rng.random() < mistakes else step)
     return record.episode()
 
 
@@ -145,7 +171,7 @@ class _Record:
         self._prefix: tuple[str, ...] = ()
         self._turns: list[WordTurn] = []
 
-    def look(self, shown: _Shown, step: PlanStep, verb: str, target: str | None) -> None:
+    def look(self, shown: Shown, step: PlanStep, verb: str, target: str | None) -> None:
         """A moment and the teacher's answer."""
         shown = self._renamed(shown)
         self._sightings.look(shown)
@@ -168,7 +194,7 @@ class _Record:
         name, _, number = object_id.rpartition("_")
         return f"{self._names.get(name, name)}_{number}"
 
-    def _renamed(self, shown: _Shown) -> _Shown:
+    def _renamed(self, shown: Shown) -> Shown:
         if not self._names:
             return shown
         pattern, types = _names_pattern()
@@ -180,7 +206,7 @@ class _Record:
             return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", self._names[kind]).lower() + ("s" if many else "")
 
         history = tuple(HistoryItem(self._ids(item.step), self._ids(item.feedback)) for item in shown.history)
-        return _Shown(
+        return Shown(
             pattern.sub(other, shown.instruction),
             shown.robot,
             tuple(map(self._id, shown.visible_objects)),

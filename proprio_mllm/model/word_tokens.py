@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from transformers import AddedToken
 
-__all__ = ["SLOTS", "WordTokens", "add_word_tokens"]
+__all__ = ["SLOTS", "WordTokens", "add_word_tokens", "first_word", "known_words"]
 
 #: Different unknown words of an episode.
 SLOTS: Final = 16
@@ -41,8 +41,8 @@ class WordTokens:
     def __init__(self, tokenizer: Any, rng: np.random.Generator | None = None) -> None:
         self.known = known_words(tokenizer)
         order = range(SLOTS) if rng is None else rng.permutation(SLOTS)
-        added = tokenizer.get_added_vocab()
-        self._free = [int(added[_SLOT[int(index)]]) for index in order][::-1]
+        first = max(self.known.values()) + 1  # slots follow the words
+        self._free = [first + int(index) for index in order][::-1]
         self._slots: dict[str, int] = {}
 
     def tokens(self, words: Sequence[str]) -> list[int]:
@@ -66,6 +66,11 @@ def _stem(word: str, known: Collection[str]) -> str:
     stems += [word[:-2]] if word.endswith("es") else []
     stems += [f"{word[:-3]}fe"] if word.endswith("ves") else []
     return next((stem for stem in stems if stem in known), word[:-1])
+
+
+def first_word(tokenizer: Any) -> int:
+    """The first token that is a word or a slot; they are the last ones that were added."""
+    return min(known_words(tokenizer).values())
 
 
 _KNOWN: Final[weakref.WeakKeyDictionary[Any, dict[str, int]]] = weakref.WeakKeyDictionary()

@@ -19,10 +19,11 @@ from typing import Any, Final
 import numpy as np
 import torch
 from torch import Tensor
+from transformers import DynamicCache
 
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
-from data.interface.sightings import Sightings
+from data.interface.sightings import Seen, Sightings
 from data.interface.steps import PlanStep
 from data.interface.symbolic import events_of
 from proprio_mllm.model.building import load_model
@@ -34,7 +35,6 @@ from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights
 
 __all__ = ["WordsPlanner", "WordsState", "plans_in_words"]
 
-_LONGEST: Final = 40
 #: Refusals of a step from one stance after which another one is taken.
 _REFUSALS: Final = 2
 _CHOICES: Final = 4
@@ -49,6 +49,8 @@ class WordsState:
         generator: draws the tokens where a temperature asks for it.
         sightings: what has been seen, and what the log says.
         log: tokens of prefix and log.
+        cache: keys and values of the first `cached` of them.
+        cached: how many.
         refused: how often each step was refused since the last one that succeeded.
     """
 
@@ -56,9 +58,11 @@ class WordsState:
     generator: torch.Generator
     sightings: Sightings = field(default_factory=Sightings)
     log: list[int] = field(default_factory=list)
+    cache: DynamicCache = field(default_factory=DynamicCache)
+    cached: int = 0
     refused: dict[str, int] = field(default_factory=dict)
 
-    def look(self, observation: Observation) -> list[int]:
+    def look(self, observation: Seen) -> list[int]:
         """Takes in an observation; the tokens that stand before the answer."""
         self.sightings.look(observation)
         if not self.log:
@@ -68,7 +72,7 @@ class WordsState:
             self._count(observation)
         return self.log + self.words.tokens(state_words(self.sightings))
 
-    def _count(self, observation: Observation) -> None:
+    def _count(self, observation: Seen) -> None:
         last = observation.history[-1]
         if any(event.ok for events in events_of([last]) for event in events):
             self.refused.clear()
@@ -117,16 +121,18 @@ class WordsPlanner:
         assert self._state is not None
         return self.step_batch([observation], [self._state])[0]
 
-    def step_batch(self, observations: Sequence[Observation], states: Sequence[WordsState] | None = None) -> list[PlannerReply]:
+    def step_batch(self, observations: Sequence[Seen], states: Sequence[WordsState] | None = None) -> list[PlannerReply]:
         """One reply per observation; the latency is the batch's, shared equally."""
         assert states is not None
         started = time.perf_counter()
         prompts = [state.look(one) for one, state in zip(observations, states, strict=True)]
         answers = [_Answer(AnswerGrammar(one.known_objects), state) for one, state in zip(observations, states, strict=True)]
         open_rows = list(range(len(answers)))
-        for _ in range(_CHOICES):
+        for choice in range(_CHOICES):
             self._write([prompts[row] for row in open_rows], [answers[row] for row in open_rows])
-            open_rows = [row for row in open_rows if not self.insist and answers[row].refused() and answers[row].reconsider()]
+            if self.insist or choice == _CHOICES - 1:
+                break
+            open_rows = [row for row in open_rows if answers[row].refused() and answers[row].reconsider()]
             if not open_rows:
                 break
         each_s = (time.perf_counter() - started) / len(answers)
@@ -139,33 +145,53 @@ class WordsPlanner:
     @torch.no_grad()
     def _write(self, prompts: Sequence[Sequence[int]], answers: Sequence[_Answer]) -> None:
         """Continues every answer to its end."""
-        text: Any = self.model.core.model.language_model
-        head: Any = self.model.core.lm_head
         rows = [[*prompt, *answer.tokens] for prompt, answer in zip(prompts, answers, strict=True)]
+        if len(rows) == 1:
+            self._write_one(rows[0], answers[0])
+            return
         size = max(map(len, rows))
         ids = torch.full((len(rows), size), self._pad)
         mask = torch.zeros(len(rows), size, dtype=torch.long)
         for number, row in enumerate(rows):
             ids[number, size - len(row) :] = torch.tensor(row)
             mask[number, size - len(row) :] = 1
-        ids, mask = ids.to(self.model.device), mask.to(self.model.device)
         places = (mask.cumsum(1) - 1).clamp_min(0)
-        out = text(input_ids=ids, attention_mask=mask, position_ids=places, use_cache=True)
-        for _ in range(_LONGEST):
-            scores = head(out.last_hidden_state[:, -1]).float().cpu()  # (B, V)
+        cache = DynamicCache()
+        while True:
+            scores = self._scores(ids, places, cache, mask)
             tokens = [answer.choose(row, self.temperature) for answer, row in zip(answers, scores, strict=True)]
             if all(token is None for token in tokens):
                 return
-            following = torch.tensor([[self._pad if token is None else token] for token in tokens], device=ids.device)
-            places = places[:, -1:] + 1
-            mask = torch.cat([mask, mask.new_ones(len(rows), 1)], 1)
-            out = text(
-                input_ids=following,
-                attention_mask=mask,
-                position_ids=places,
-                past_key_values=out.past_key_values,
-                use_cache=True,
-            )
+            ids = torch.tensor([[self._pad if token is None else token] for token in tokens])
+            places, mask = places[:, -1:] + 1, torch.cat([mask, mask.new_ones(len(rows), 1)], 1)
+
+    def _write_one(self, row: Sequence[int], answer: _Answer) -> None:
+        """One answer; what the log has been read of before is not read again."""
+        state, start = answer.state, answer.state.cached
+        ids = torch.tensor([row[start:]])
+        while True:
+            scores = self._scores(ids, torch.arange(start, start + ids.shape[1])[None], state.cache, None)
+            token = answer.choose(scores[0], self.temperature)
+            if token is None:
+                break
+            start += ids.shape[1]
+            ids = torch.tensor([[token]])
+        state.cached = len(state.log)
+        state.cache.crop(state.cached - state.cache.get_seq_length())  # minus what is no log
+
+    def _scores(self, ids: Tensor, places: Tensor, cache: DynamicCache, mask: Tensor | None) -> Tensor:
+        """Scores (B, V) of what follows tokens (B, L) at places (B, L)."""
+        text: Any = self.model.core.model.language_model
+        head: Any = self.model.core.lm_head
+        device = self.model.device
+        out = text(
+            input_ids=ids.to(device),
+            attention_mask=None if mask is None else mask.to(device),
+            position_ids=places.to(device),
+            past_key_values=cache,
+            use_cache=True,
+        )
+        return head(out.last_hidden_state[:, -1]).float().cpu()
 
 
 def plans_in_words(folder: str | Path) -> bool:
@@ -178,7 +204,7 @@ class _Answer:
     """An answer under way: its words and tokens, and what else was likely at each of them."""
 
     def __init__(self, grammar: AnswerGrammar, state: WordsState) -> None:
-        self._grammar, self._state = grammar, state
+        self._grammar, self.state = grammar, state
         self.words: list[str] = []
         self.tokens: list[int] = []
         self._margins: list[float] = []
@@ -189,10 +215,10 @@ class _Answer:
         options = [word for word in self._grammar.allowed(self.words) if word not in self._forbidden.get(tuple(self.words), ())]
         if not options:
             return None
-        tokens = [self._state.words.tokens([word])[0] for word in options]
+        tokens = [self.state.words.tokens([word])[0] for word in options]
         values = scores[tokens]
         if temperature > 0.0:
-            index = int(torch.multinomial((values / temperature).softmax(-1), 1, generator=self._state.generator))
+            index = int(torch.multinomial((values / temperature).softmax(-1), 1, generator=self.state.generator))
         else:
             index = int(values.argmax())
         others = values[torch.arange(len(options)) != index]
@@ -207,7 +233,7 @@ class _Answer:
 
     def refused(self) -> bool:
         """Whether this step was refused as often as it may be."""
-        return self._state.refused.get(self.step().to_text(), 0) >= _REFUSALS
+        return self.state.refused.get(self.step().to_text(), 0) >= _REFUSALS
 
     def reconsider(self) -> bool:
         """Goes back to the word of the step that was least certain, and rules it out; false where there was no other."""

@@ -27,7 +27,7 @@ from proprio_mllm.training.checkpoint import load_checkpoint, save_checkpoint
 from proprio_mllm.training.metrics import MetricWriter
 from proprio_mllm.training.muon import Muon, linear_weights
 
-__all__ = ["LoopResult", "Objective", "learning_rate", "make_optimizer", "run_loop"]
+__all__ = ["LoopResult", "Objective", "Parts", "learning_rate", "make_optimizer", "run_loop"]
 
 logger = logging.getLogger(__name__)
 
@@ -51,6 +51,10 @@ class Objective(Protocol):
     def loss(self, module: nn.Module, batch: Any, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
         """Loss and metrics of a batch through `module` (possibly wrapped for several processes)."""
         ...
+
+
+class Parts(tuple[Any, ...]):
+    """A batch whose loss, and whose metrics, are the sums of its parts'; each part is let go of before the next is computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +98,7 @@ def make_optimizer(module: nn.Module, cfg: LoopConfig) -> torch.optim.Optimizer:
     ]
     groups = [group for group in groups if group["params"]]
     if matrices:
-        return Muon(matrices, groups, cfg.lr, weight_decay=cfg.weight_decay)
+        return Muon(matrices, groups, cfg.lr, weight_decay=cfg.weight_decay, adam_share=cfg.adam_share)
     return torch.optim.AdamW(groups, lr=cfg.lr, betas=(0.9, 0.99))
 
 
@@ -141,15 +145,21 @@ def run_loop(
             draw_seed = (seed * 1_000_003 + step) * 64 + rank
             generator = torch.Generator().manual_seed(draw_seed)
             torch.manual_seed(draw_seed)  # dropout draws from torch's own
-            with torch.autocast(accelerator.device.type, torch.bfloat16, enabled=cfg.precision == "bf16"):
-                loss, values = objective.loss(module, _moved(batch, accelerator.device), generator)
-            if not bool(torch.isfinite(loss)):
-                raise FloatingPointError(f"{objective.name}: loss {float(loss.detach())} at step {step}; lower lr ({cfg.lr})")
-            accelerator.backward(loss)
+            found: dict[str, float] = {}
+            for part in batch if isinstance(batch, Parts) else (batch,):
+                with torch.autocast(accelerator.device.type, torch.bfloat16, enabled=cfg.precision == "bf16"):
+                    loss, values = objective.loss(module, _moved(part, accelerator.device), generator)
+                if not bool(torch.isfinite(loss)):
+                    raise FloatingPointError(
+                        f"{objective.name}: loss {float(loss.detach())} at step {step}; lower lr ({cfg.lr})"
+                    )
+                accelerator.backward(loss)
+                for name, value in {"loss": float(loss.detach()), **values}.items():
+                    found[name] = found.get(name, 0.0) + value
             norm = accelerator.clip_grad_norm_(trained, cfg.clip)
             prepared.step()
             prepared.zero_grad(set_to_none=True)
-            for name, value in {"loss": float(loss.detach()), "grad_norm": float(norm or 0.0), **values}.items():
+            for name, value in {**found, "grad_norm": float(norm or 0.0)}.items():
                 sums[name] = sums.get(name, 0.0) + value
                 sums[f"#{name}"] = sums.get(f"#{name}", 0.0) + 1.0
             counted += 1

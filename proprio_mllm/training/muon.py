@@ -60,6 +60,7 @@ class Muon(torch.optim.Optimizer):
         betas: AdamW's.
         momentum: of the matrices.
         weight_decay: of the matrices.
+        adam_share: AdamW's learning rate over `lr`.
     """
 
     def __init__(
@@ -70,9 +71,10 @@ class Muon(torch.optim.Optimizer):
         betas: tuple[float, float] = (0.9, 0.99),
         momentum: float = 0.95,
         weight_decay: float = 0.01,
+        adam_share: float = 1.0,
     ) -> None:
-        wanted = [{"params": list(matrices), "weight_decay": weight_decay, "orthogonal": True}]
-        wanted += [{**group, "orthogonal": False} for group in groups]
+        wanted = [{"params": list(matrices), "weight_decay": weight_decay, "orthogonal": True, "share": 1.0}]
+        wanted += [{**group, "orthogonal": False, "share": adam_share} for group in groups]
         defaults = {"lr": lr, "betas": betas, "momentum": momentum, "weight_decay": weight_decay, "eps": 1e-8}
         super().__init__([group for group in wanted if group["params"]], defaults)
 
@@ -84,9 +86,10 @@ class Muon(torch.optim.Optimizer):
             for parameter in group["params"]:
                 if parameter.grad is None:
                     continue
-                parameter.mul_(1.0 - group["lr"] * group["weight_decay"])
+                lr = group["lr"] * group["share"]
+                parameter.mul_(1.0 - lr * group["weight_decay"])
                 change = self._matrix if group["orthogonal"] else self._adam
-                parameter.sub_(change(parameter, group), alpha=group["lr"])
+                parameter.sub_(change(parameter, group), alpha=lr)
         return loss
 
     def _matrix(self, parameter: Tensor, group: dict[str, Any]) -> Tensor:

@@ -108,8 +108,9 @@ def base_model_config(model: ModelConfig) -> ModelConfig:
 
 
 def loop_values(cfg: LoopConfig) -> dict[str, Any]:
-    """A loop's values for a key: AdamW goes without saying, so that output from before there was a choice stays current."""
-    return {name: value for name, value in dataclasses.asdict(cfg).items() if (name, value) != ("optimizer", "adamw")}
+    """A loop's values for a key: defaults go without saying, so that output from before there was a choice stays current."""
+    silent = {"optimizer": "adamw", "adam_share": 1.0}
+    return {name: value for name, value in dataclasses.asdict(cfg).items() if silent.get(name) != value}
 
 
 def seeded(make: Callable[[], Any], seed: int) -> Any:

@@ -8,7 +8,7 @@ paper starts from a language model that can read; this is what stands in for its
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final
 
@@ -20,8 +20,9 @@ from torch.nn import functional
 from proprio_mllm.model.batch import IGNORE, Movable
 from proprio_mllm.model.branches import Branches, with_branches
 from proprio_mllm.model.modeling import ProprioMLLM
-from proprio_mllm.model.word_tokens import WordTokens
+from proprio_mllm.model.word_tokens import WordTokens, first_word
 from proprio_mllm.model.wording import WordEpisode
+from proprio_mllm.training.loop import Parts
 
 __all__ = ["Lessons", "WordBatch", "WordsObjective", "collate", "held_out", "rows_of", "words_loss"]
 
@@ -58,12 +59,18 @@ class WordBatch(Movable):
         position_ids: (B, S).
         labels: (B, S), the token that each position has to predict, -100 where nothing is learnt.
         layout: where the branches are.
+        answers: answer tokens of the whole step, of which these rows are a part.
+        decisions: decisions of the whole step.
+        parts: parts of the step.
     """
 
     input_ids: Tensor
     position_ids: Tensor
     labels: Tensor
     layout: Branches
+    answers: int = 1
+    decisions: int = 1
+    parts: int = 1
 
 
 def rows_of(episode: WordEpisode, words: WordTokens) -> list[_Row]:
@@ -110,8 +117,29 @@ def _bucket(size: int, sizes: Sequence[int]) -> int:
     return next(one for one in sizes if one >= size)
 
 
-def words_loss(model: ProprioMLLM, batch: WordBatch) -> tuple[Tensor, int, int, Tensor]:
-    """Summed cross-entropy, learnt tokens, those predicted right, and which positions (B, S) were right."""
+@dataclass(frozen=True, slots=True)
+class WordsLoss:
+    """Of one batch.
+
+    Attributes:
+        answers: summed cross-entropy of the answers' tokens.
+        reading: mean cross-entropy of the tokens that are read; 0 where it was not asked for.
+        right: (B, S), learnt positions that were predicted right.
+    """
+
+    answers: Tensor
+    reading: Tensor
+    right: Tensor
+
+
+def words_loss(model: ProprioMLLM, batch: WordBatch, reading: bool = False) -> WordsLoss:
+    """Losses of a batch.
+
+    Args:
+        model: the model.
+        batch: rows of log and branches.
+        reading: whether to predict what is read, too.
+    """
     core: Any = model.core
     text: Any = core.model.language_model
     with with_branches(text):
@@ -121,13 +149,26 @@ def words_loss(model: ProprioMLLM, batch: WordBatch) -> tuple[Tensor, int, int, 
             position_ids=batch.position_ids,
             use_cache=False,
         )[0]  # (B, S, D)
+    first = first_word(model.processor.tokenizer)
+    table = core.lm_head.weight[first:]  # words are the last tokens that were added, and all that is ever predicted here
     chosen = batch.labels != IGNORE
-    picked = batch.labels[chosen]
-    logits = core.lm_head(hidden[chosen]).float()  # (targets, V)
-    right = logits.detach().argmax(-1) == picked
-    found = torch.zeros_like(chosen)
-    found[chosen] = right
-    return functional.cross_entropy(logits, picked, reduction="sum"), int(picked.numel()), int(right.sum()), found
+    picked = batch.labels[chosen] - first
+    logits = functional.linear(hidden[chosen], table).float()  # (targets, words)
+    right = torch.zeros_like(chosen)
+    right[chosen] = logits.detach().argmax(-1) == picked
+    read = logits.new_zeros(())
+    if reading:
+        following = batch.input_ids.roll(-1, 1)
+        pad = int(model.processor.tokenizer.pad_token_id)
+        told = (batch.input_ids != pad) & (following != pad) & ~chosen
+        told[:, batch.layout.log - 1 :: _width(batch)] = False  # the last position of the log and of each branch
+        read = functional.cross_entropy(functional.linear(hidden[told], table).float(), following[told] - first)
+    return WordsLoss(functional.cross_entropy(logits, picked, reduction="sum"), read, right)
+
+
+def _width(batch: WordBatch) -> int:
+    """Tokens of a branch, W."""
+    return (batch.input_ids.shape[1] - batch.layout.log) // batch.layout.anchors.shape[1]
 
 
 class WordsObjective:
@@ -137,12 +178,13 @@ class WordsObjective:
         model: all of its language model trains.
         lessons: the source of episodes.
         key: of the checkpoint.
+        reading: weight of predicting what is read.
     """
 
     name = "words"
 
-    def __init__(self, model: ProprioMLLM, lessons: Lessons, key: str) -> None:
-        self.model, self._lessons, self.key = model, lessons, key
+    def __init__(self, model: ProprioMLLM, lessons: Lessons, key: str, reading: float = 0.0) -> None:
+        self.model, self._lessons, self.key, self._reading = model, lessons, key, reading
         self._pad = int(model.processor.tokenizer.pad_token_id)
 
     @property
@@ -150,7 +192,7 @@ class WordsObjective:
         """The whole model."""
         return self.model
 
-    def batch(self, rng: np.random.Generator, size: int) -> tuple[WordBatch, ...]:
+    def batch(self, rng: np.random.Generator, size: int) -> Parts:
         """Rows of `size` episodes in parts of few shapes; what does not fill a part is left out where others do."""
         rows: list[_Row] = []
         for _ in range(size):
@@ -159,34 +201,45 @@ class WordsObjective:
         shapes: dict[tuple[int, int], list[_Row]] = {}
         for row in rows:
             shapes.setdefault(row.shape, []).append(row)
-        return tuple(
+        made = [
             collate(same[first : first + _ROWS], self._pad)
             for _, same in sorted(shapes.items())
             for first in range(0, len(same), _ROWS)
             if len(same) - first >= _ROWS or first == 0
-        )
+        ]
+        answers = sum(int((part.labels != IGNORE).sum()) for part in made)
+        decisions = sum(int(_learnt(part).any(-1).sum()) for part in made)
+        return Parts(replace(part, answers=answers, decisions=decisions, parts=len(made)) for part in made)
 
-    def loss(
-        self, module: nn.Module, batch: tuple[WordBatch, ...], generator: torch.Generator
-    ) -> tuple[Tensor, Mapping[str, float]]:
-        """Mean over the learnt tokens, and the share of decisions whose tokens are all right."""
+    def loss(self, module: nn.Module, batch: WordBatch, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
+        """A part's contribution to the mean over the answers' tokens, and to the share of decisions that are all right."""
         del generator
         made: Any = module
-        total, count, right, whole, decisions = torch.zeros(()), 0, 0, 0, 0
-        for part in batch:
-            loss, tokens, correct, found = words_loss(made, part)
-            total, count, right = total + loss, count + tokens, right + correct
-            missed = ((part.labels != IGNORE) & ~found)[:, part.layout.log :].unflatten(1, (_TURNS, -1)).any(-1)
-            there = (part.labels != IGNORE)[:, part.layout.log :].unflatten(1, (_TURNS, -1)).any(-1)
-            whole, decisions = whole + int((there & ~missed).sum()), decisions + int(there.sum())
-        values = {"accuracy": right / max(count, 1), "exact": whole / max(decisions, 1), "decisions": float(decisions)}
-        return total / max(count, 1), values
+        losses = words_loss(made, batch, self._reading > 0.0)
+        answers, reading = losses.answers / max(batch.answers, 1), losses.reading / batch.parts
+        learnt = _learnt(batch)
+        missed = learnt & ~losses.right[:, batch.layout.log :].unflatten(1, (_TURNS, -1))
+        exact = int((learnt.any(-1) & ~missed.any(-1)).sum())
+        values = {
+            "answers": float(answers.detach()),
+            "reading": float(reading.detach()),
+            "exact": exact / max(batch.decisions, 1),
+            "decisions": float(learnt.any(-1).sum()),
+        }
+        return answers + self._reading * reading, values
+
+
+def _learnt(batch: WordBatch) -> Tensor:
+    """(B, N, W), which positions of each branch have something to predict."""
+    return (batch.labels != IGNORE)[:, batch.layout.log :].unflatten(1, (_TURNS, -1))
 
 
 @torch.no_grad()
 def held_out(model: ProprioMLLM, lessons: Lessons, episodes: int = 64) -> dict[str, float]:
     """Exactness on episodes whose seeds training does not draw: negative ones."""
     objective = WordsObjective(model, lambda seed: lessons(-1 - seed % 2**31), "")
-    batch = objective.batch(np.random.default_rng(0), episodes)
-    loss, values = objective.loss(model, batch, torch.Generator())
-    return {"held_out_loss": float(loss), "held_out_exact": values["exact"], "held_out_accuracy": values["accuracy"]}
+    values = [objective.loss(model, part, torch.Generator())[1] for part in objective.batch(np.random.default_rng(0), episodes)]
+    return {
+        "held_out_loss": sum(value["answers"] for value in values),
+        "held_out_exact": sum(value["exact"] for value in values),
+    }

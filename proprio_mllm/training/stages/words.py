@@ -39,6 +39,7 @@ class WordsStage:
         model = build_model(cfg, processor, pipeline.cfg.seed)
         model.requires_grad_(False)
         model.core.model.language_model.requires_grad_(True)
-        pipeline.loop(WordsObjective(model, pipeline.lessons.episode, key), pipeline.cfg.words, folder / "loop")
+        objective = WordsObjective(model, pipeline.lessons.episode, key, pipeline.cfg.words.reading)
+        pipeline.loop(objective, pipeline.cfg.words.loop, folder / "loop")
         save_model(model.eval(), pipeline.paths.model("words"))
         return held_out(model, pipeline.lessons.episode)
