@@ -33,19 +33,19 @@ __all__ = ["LARGEST_MB", "export", "find_model", "release_name"]
 
 #: Largest size of one released folder, megabytes.
 LARGEST_MB: Final = 30.0
-_MODELS: Final = ("base", "alignment", "selu")
+_MODELS: Final = ("words", "base", "alignment", "selu")
 
 
 def release_name(stage: str, variant: str) -> str:
-    """Name of a released model: `base`, the variant for the last stage's model, `full-alignment` for the one before."""
-    return {"base": "base", "selu": variant}.get(stage, f"{variant}-{stage}")
+    """Name of a released model: `words`, `base`, the variant for the last stage's, `full-alignment` for the one before."""
+    return {"words": "words", "base": "base", "selu": variant}.get(stage, f"{variant}-{stage}")
 
 
 def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
-    """Copies the base model and the variant's newest finished model to `folder/<model>/<name>`.
+    """Copies the models of words and base, and the variant's newest finished model to `folder/<model>/<name>`.
 
     What rests on a stage that has not finished under this configuration is left out. The model of stage `alignment` is copied
-    only while `selu` has not finished, and the base model only when `folder` does not hold the same one already.
+    only while `selu` has not finished, and those of words and base only when `folder` does not hold the same ones already.
 
     Args:
         pipeline: names folders and keys.
@@ -69,12 +69,12 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
             continue
         key = pipeline.key(stage)
         target = Path(folder) / pipeline.cfg.model.name / release_name(stage, pipeline.cfg.variant)
-        if stage == "base" and _released_key(target) == key:  # every variant's export meets it again
+        if stage in ("words", "base") and _released_key(target) == key:  # every variant's export meets them again
             continue
         with new_folder(target) as work:
             shutil.copytree(source, work, dirs_exist_ok=True)
             _shrink(work)
-            if stage != "base" and (work / "vlm").is_dir():
+            if stage not in ("words", "base") and (work / "vlm").is_dir():
                 share_backbone(work, target.with_name(release_name("base", "")))
             provenance = json.dumps(_provenance(pipeline, stage, key), indent=1)
             (work / "provenance.json").write_text(provenance + "\n", encoding="utf-8")
@@ -139,7 +139,7 @@ def find_model(output: str | Path, weights: str | Path, model: str, variant: str
     Raises:
         FileNotFoundError: when neither exists; the message names the command that trains it.
     """
-    group = "shared" if stage == "base" else variant
+    group = "shared" if stage in ("words", "base") else variant
     trained = Path(output) / model / group / stage
     if finished_key(trained) is not None and (trained / "model").is_dir():
         return trained / "model"

@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from configs.schema.train import LoggerConfig, LoopConfig
-from proprio_mllm.training.loop import learning_rate, run_loop
+from proprio_mllm.training.loop import Parts, learning_rate, run_loop
 from proprio_mllm.training.metrics import MetricWriter
 
 CFG = LoopConfig(steps=30, batch=8, lr=1e-2, warmup=3, checkpoint_every=4, log_every=5)
@@ -57,6 +57,35 @@ def test_same_seed_same_weights(tmp_path: Path) -> None:
     assert all(torch.equal(x, y) for x, y in zip(first, second, strict=True))
     other = run(tmp_path / "c", Line(), seed=6)
     assert not all(torch.equal(x, y) for x, y in zip(first, other, strict=True))
+
+
+class InParts(Line):
+    """The same line, its batches in two parts; without noise, which would be drawn for each part."""
+
+    def batch(self, rng: np.random.Generator, size: int) -> Parts:
+        whole = super().batch(rng, size)
+        return Parts((whole[: size // 4], whole[size // 4 :]))
+
+    def loss(self, module: nn.Module, batch: Tensor, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
+        share = len(batch) / CFG.batch
+        return share * (module(batch) - batch.sum(1, keepdim=True)).square().mean(), {"share": share}
+
+
+class Whole(InParts):
+    """Its batches in one."""
+
+    def batch(self, rng: np.random.Generator, size: int) -> Tensor:
+        return Line.batch(self, rng, size)
+
+
+def test_parts_add_up_to_their_batch(tmp_path: Path) -> None:
+    parts, whole = run(tmp_path / "parts", InParts()), run(tmp_path / "whole", Whole())
+    for ours, theirs in zip(parts, whole, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-3)
+    rows = [(tmp_path / name / "metrics.csv").read_text().splitlines() for name in ("parts", "whole")]
+    first = [dict(zip(lines[0].split(","), lines[1].split(","), strict=True)) for lines in rows]
+    assert float(first[0]["share"]) == float(first[1]["share"]) == 1.0
+    assert float(first[0]["loss"]) == pytest.approx(float(first[1]["loss"]), rel=1e-3)
 
 
 SCRIPT = """

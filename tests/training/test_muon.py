@@ -66,6 +66,19 @@ def _run(folder: Path, objective: Line, cfg: LoopConfig) -> list[torch.Tensor]:
     return [tensor.clone() for tensor in objective.module.state_dict().values()]
 
 
+def test_other_parameters_may_have_a_rate_of_their_own() -> None:
+    def moved(share: float) -> tuple[float, float]:
+        matrix, vector = nn.Parameter(torch.ones(4, 4)), nn.Parameter(torch.ones(4))
+        optimizer = Muon([matrix], [{"params": [vector], "weight_decay": 0.0}], 0.01, weight_decay=0.0, adam_share=share)
+        matrix.grad, vector.grad = torch.eye(4), torch.ones(4)
+        optimizer.step()
+        return float((matrix - 1.0).detach().abs().max()), float((vector - 1.0).detach().abs().max())
+
+    (matrix, vector), (same, less) = moved(1.0), moved(0.25)
+    assert same == matrix
+    assert less == pytest.approx(vector / 4.0, rel=1e-3)
+
+
 def test_a_run_continues_from_its_checkpoint(tmp_path: Path) -> None:
     whole = _run(tmp_path / "whole", Line(), CFG)
 

@@ -303,7 +303,7 @@ def _stopped(*_: object) -> None:
 
 def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written = release.export(trained, tmp_path)
-    assert [folder.name for folder in written] == ["base", "full"]
+    assert [folder.name for folder in written] == ["words", "base", "full"]
     about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
     assert list(about["stages"]) == ["base", "dagger", "pointmap", "tokenizer", "alignment", "selu"]
     assert all(stage["command"] == "python train.py stage=all" and stage["metrics"] for stage in about["stages"].values())
