@@ -65,7 +65,7 @@ def in_words(request_: DaggerRequest, monkeypatch: pytest.MonkeyPatch) -> Dagger
         return [None if moment["step"] % 3 == 2 else PlanStep.parse(f"Pick(left, {moment['known'][-1]})") for moment in moments]
 
     monkeypatch.setattr(dagger, "student_in_text", lambda model: reader)
-    return dataclasses.replace(request_, kind="text_planning", episodes=6)
+    return dataclasses.replace(request_, kind="text_planning", episodes=30)
 
 
 def test_corrections_in_words_are_exercises(in_words: DaggerRequest) -> None:

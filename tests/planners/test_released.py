@@ -17,6 +17,7 @@ from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.mllm import MllmPlanner
 from proprio_mllm.planners.protocol import TaskInfo
 from proprio_mllm.planners.random_planner import RandomPlanner
+from proprio_mllm.planners.words import WordsPlanner
 from sim.tasks.task import load_benchmark, write_tasks
 
 WEIGHTS = Path(__file__).parents[2] / "weights" / "tiny"
@@ -40,7 +41,18 @@ def first() -> Observation:
 
 
 def test_every_folder_is_known() -> None:
-    assert sorted(path.name for path in WEIGHTS.iterdir()) == sorted(PARTS)
+    assert sorted(path.name for path in WEIGHTS.iterdir()) == sorted((*PARTS, "words"))
+
+
+def test_words_alone_plan(first: Observation) -> None:
+    planner = WordsPlanner.load(WEIGHTS / "words")
+    planner.reset(TaskInfo(first.instruction, first.robot, first.time_limit), np.random.default_rng(0))
+    reply = planner.step(first, None)
+    assert reply.step is not None
+    assert reply.step.actions[0].name != "Done"
+    about = json.loads((WEIGHTS / "words" / "provenance.json").read_text())
+    assert list(about["stages"]) == ["words"]
+    assert about["stages"]["words"]["metrics"]["held_out_exact"] > 0.7
 
 
 @pytest.mark.parametrize("name", PARTS)

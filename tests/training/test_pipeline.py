@@ -294,7 +294,7 @@ def test_a_stage_that_is_stopped_is_not_finished(trained: Pipeline, tmp_path: Pa
         longer.run("pointmap")
     with pytest.raises(StageError, match=r"run `python train\.py stage=pointmap` first"):
         Pipeline(STAGES, dataclasses.replace(cfg, overwrite=True)).run("alignment")
-    assert [path.name for path in release.export(Pipeline(STAGES, cfg), tmp_path / "weights")] == ["base"]
+    assert [path.name for path in release.export(Pipeline(STAGES, cfg), tmp_path / "weights")] == ["words", "base"]
 
 
 def _stopped(*_: object) -> None:
