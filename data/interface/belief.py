@@ -13,16 +13,18 @@ from typing import Final
 
 from data.interface.actions import ActionKind
 from data.interface.bodies import Arm
-from data.interface.effects import Condition, Grasp, HoldOpen, PutDown, Rise, Turn, Walk
+from data.interface.effects import Condition, Grasp, HoldOpen, LetGo, PutDown, Rise, Turn, Walk
 from data.interface.failures import FailureCode
 from data.interface.observation import HistoryItem
 from data.interface.steps import Action
 from data.interface.symbolic import Event, SymbolicState, events_of
 
-__all__ = ["UNKNOWN", "Belief"]
+__all__ = ["ARM_SPECIFIC", "UNKNOWN", "Belief"]
 
 #: What a hand holds when a code says that it is full and nobody knows of what.
 UNKNOWN: Final = "?"
+#: Codes after which the other arm may do what one could not.
+ARM_SPECIFIC: Final = (FailureCode.OBSTRUCTED, FailureCode.GRASP_MISSED, FailureCode.HANDLE_SLIPPED)
 #: Codes after which what was in the hand no longer is.
 _LOST_HOLD: Final = (FailureCode.SLIPPED, FailureCode.DROPPED, FailureCode.PLACE_MISSED, FailureCode.BROKE)
 #: Codes that say that the action will never work on the object.
@@ -145,7 +147,7 @@ class Belief:
 
     def _succeeded(self, action: Action, target: str) -> None:
         held = None if action.arm is None else self.state.held[action.arm]
-        if action.name == "Release" and held is not None and held in self.state.self_closing:
+        if action.spec.has_effect(LetGo) and held is not None and held in self.state.self_closing:
             self.let_shut[held] = self.let_shut.get(held, 0) + 1
         self.state.succeed(action)
         if action.spec.has_effect(Walk, Turn) and action.object_id is not None:

@@ -39,13 +39,13 @@ from proprio_mllm.model.wording import (
 )
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 from sim.collection.text_planning import draw_task
-from sim.collection.text_world import TextWorld
+from sim.collection.text_world import TextWorld, feedback_text
 from sim.robots.spec import load_robot
 from sim.scene.catalogue import load_catalogue
 from sim.tasks.instructions import ORDINALS, TEMPLATES, natural_name, plural
 from sim.tasks.sample import TRAIN_ROOMS, rng_for
 
-__all__ = ["Lessons", "Shown", "WordsOnly", "lesson_in_words", "lesson_words"]
+__all__ = ["Lessons", "Shown", "WordsOnly"]
 
 #: Shares of steps that are mistakes, one drawn per episode.
 _MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
@@ -66,38 +66,6 @@ class Shown:
     visible_objects: tuple[str, ...]
     known_objects: tuple[str, ...]
     history: tuple[HistoryItem, ...] = ()
-
-
-class Lessons:
-    """The source of episodes that `train.py` hands to training.
-
-    Args:
-        robots: robots that act in them.
-    """
-
-    def __init__(self, robots: Sequence[str] = PAPER_ROBOTS) -> None:
-        self._robots = tuple(robots)
-
-    def words(self) -> tuple[str, ...]:
-        """Every word of them, apart from made-up names."""
-        return lesson_words(self._robots)
-
-    def episode(self, seed: int) -> WordEpisode:
-        """The episode of a seed."""
-        return lesson_in_words(seed, robots=self._robots)
-
-
-def lesson_words(robots: Sequence[str] = PAPER_ROBOTS) -> tuple[str, ...]:
-    """Every word of the sequences: markers, the grammar of actions, all types of the catalogue, all wordings of tasks."""
-    types = list(load_catalogue().types)
-    names = [word for name in types for word in (*id_words(f"{name}_1")[:-1], *text_words(natural_name(name)))]
-    spoken = [
-        word for sentences in TEMPLATES.values() for text in sentences for word in text_words(re.sub(r"\{\w+\}", " ", text))
-    ]
-    other = [*ORDINALS, *_COUNTS, "a", "an", "the", "in", "on", "from", "off"]
-    codes = [str(code) for code in FAILURES]
-    words = (*MARKERS, *robots, *ACTIONS, *codes, *ID_NUMBERS, *number_words(), *names, *spoken, *other)
-    return tuple(dict.fromkeys(words))
 
 
 class WordsOnly:
@@ -138,28 +106,48 @@ class WordsOnly:
 
     def take(self, step: PlanStep) -> None:
         """Carries a step out."""
-        outcomes = self.world.take(step)
-        feedback = "; ".join(f"{action.to_text()} {code}" for action, code in outcomes)
-        self._history.append(HistoryItem(step.to_text(), feedback))
+        self._history.append(HistoryItem(step.to_text(), feedback_text(self.world.take(step))))
 
 
-def lesson_in_words(seed: int, robots: Sequence[str] = PAPER_ROBOTS) -> WordEpisode:
-    """An episode of the text world with the teacher's answers; some steps that are taken are mistakes."""
-    episode = WordsOnly(seed, robots=robots)
-    rng, world = episode.rng, episode.world
-    teacher, record = ScriptedPlanner(), _Record(_new_names(episode.task.objects, episode.scene.furniture, rng))
-    mistakes = float(rng.choice(_MISTAKES))
-    while episode.steps < _MAX_STEPS:
-        shown = episode.shown()
-        if world.done():
-            record.look(shown, PlanStep((Action("Done"),)), "Done", "")
-            break
-        step, job = teacher.decide(shown)
-        if job is None:  # it gives up
-            break
-        record.look(shown, step, job.verb, job.target)
-        episode.take(world.mistake(step) if rng.random() < mistakes else step)
-    return record.episode()
+class Lessons:
+    """The source of episodes that `train.py` hands to training.
+
+    Args:
+        robots: robots that act in them.
+    """
+
+    def __init__(self, robots: Sequence[str] = PAPER_ROBOTS) -> None:
+        self._robots = tuple(robots)
+
+    def words(self) -> tuple[str, ...]:
+        """Every word but made-up names: markers, the grammar of actions, all types of the catalogue, all wordings of tasks."""
+        types = list(load_catalogue().types)
+        names = [word for name in types for word in (*id_words(f"{name}_1")[:-1], *text_words(natural_name(name)))]
+        spoken = [
+            word for sentences in TEMPLATES.values() for text in sentences for word in text_words(re.sub(r"\{\w+\}", " ", text))
+        ]
+        other = [*ORDINALS, *_COUNTS, "a", "an", "the", "in", "on", "from", "off"]
+        codes = [str(code) for code in FAILURES]
+        words = (*MARKERS, *self._robots, *ACTIONS, *codes, *ID_NUMBERS, *number_words(), *names, *spoken, *other)
+        return tuple(dict.fromkeys(words))
+
+    def episode(self, seed: int) -> WordEpisode:
+        """The episode of a seed in the text world, with the teacher's answers; some steps that are taken are mistakes."""
+        episode = WordsOnly(seed, robots=self._robots)
+        rng, world = episode.rng, episode.world
+        teacher, record = ScriptedPlanner(), _Record(_new_names(episode.task.objects, episode.scene.furniture, rng))
+        mistakes = float(rng.choice(_MISTAKES))
+        while episode.steps < _MAX_STEPS:
+            shown = episode.shown()
+            if world.done():
+                record.look(shown, PlanStep((Action("Done"),)), "Done", "")
+                break
+            step, job = teacher.decide(shown)
+            if job is None:  # it gives up
+                break
+            record.look(shown, step, job.verb, job.target)
+            episode.take(world.mistake(step) if rng.random() < mistakes else step)
+        return record.episode()
 
 
 class _Record:

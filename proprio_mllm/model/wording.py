@@ -21,10 +21,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from data.interface.actions import ACTIONS, ActionKind
-from data.interface.belief import UNKNOWN, Belief
+from data.interface.belief import ARM_SPECIFIC, UNKNOWN, Belief
 from data.interface.bodies import Arm
 from data.interface.effects import Condition
-from data.interface.failures import FailureCode
 from data.interface.observation import HistoryItem
 from data.interface.sightings import Seen, Sightings
 from data.interface.steps import Action, PlanStep
@@ -69,8 +68,6 @@ _STATES: Final[Mapping[Condition, tuple[str, str]]] = {
     Condition.USED_UP: ("used", ""),
     Condition.FILLED: ("filled", "drained"),
 }
-#: Codes for which the arm is to blame: which arms met them is told.
-_OF_ARM: Final = (FailureCode.OBSTRUCTED, FailureCode.GRASP_MISSED, FailureCode.HANDLE_SLIPPED)
 _MOST: Final = 16
 
 
@@ -182,7 +179,7 @@ def _tried(belief: Belief) -> list[str]:
     """What was tried from here without success."""
     words: list[str] = []
     for (verb, target), events in belief.fails.items():
-        arms = {event.action.arm for event in events if event.code in _OF_ARM and event.action.arm is not None}
+        arms = {event.action.arm for event in events if event.code in ARM_SPECIFIC and event.action.arm is not None}
         words += ["fail", verb, *(id_words(target) if target else ()), *sorted(arms)]
         words += [_count(len(events))] if len(events) > 1 else []
     for target, count in belief.stances.items():

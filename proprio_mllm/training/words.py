@@ -24,10 +24,8 @@ from proprio_mllm.model.word_tokens import WordTokens, first_word
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.loop import Parts
 
-__all__ = ["Lessons", "WordBatch", "WordsObjective", "collate", "held_out", "rows_of", "words_loss"]
+__all__ = ["WordBatch", "WordsObjective", "collate", "held_out", "rows_of", "words_loss"]
 
-#: The episode of a seed.
-Lessons = Callable[[int], WordEpisode]
 #: Decisions of a row, and rows that are computed together.
 _TURNS: Final = 6
 _ROWS: Final = 8
@@ -176,15 +174,15 @@ class WordsObjective:
 
     Args:
         model: all of its language model trains.
-        lessons: the source of episodes.
+        episode: the episode of a seed.
         key: of the checkpoint.
         reading: weight of predicting what is read.
     """
 
     name = "words"
 
-    def __init__(self, model: ProprioMLLM, lessons: Lessons, key: str, reading: float = 0.0) -> None:
-        self.model, self._lessons, self.key, self._reading = model, lessons, key, reading
+    def __init__(self, model: ProprioMLLM, episode: Callable[[int], WordEpisode], key: str, reading: float = 0.0) -> None:
+        self.model, self._episode, self.key, self._reading = model, episode, key, reading
         self._pad = int(model.processor.tokenizer.pad_token_id)
 
     @property
@@ -196,7 +194,7 @@ class WordsObjective:
         """Rows of `size` episodes in parts of few shapes; what does not fill a part is left out where others do."""
         rows: list[_Row] = []
         for _ in range(size):
-            episode = self._lessons(int(rng.integers(2**62)))
+            episode = self._episode(int(rng.integers(2**62)))
             rows += rows_of(episode, WordTokens(self.model.processor.tokenizer, rng))
         shapes: dict[tuple[int, int], list[_Row]] = {}
         for row in rows:
@@ -235,10 +233,10 @@ def _learnt(batch: WordBatch) -> Tensor:
 
 
 @torch.no_grad()
-def held_out(model: ProprioMLLM, lessons: Lessons, episodes: int = 64) -> dict[str, float]:
+def held_out(model: ProprioMLLM, episode: Callable[[int], WordEpisode], count: int = 64) -> dict[str, float]:
     """Exactness on episodes whose seeds training does not draw: negative ones."""
-    objective = WordsObjective(model, lambda seed: lessons(-1 - seed % 2**31), "")
-    values = [objective.loss(model, part, torch.Generator())[1] for part in objective.batch(np.random.default_rng(0), episodes)]
+    objective = WordsObjective(model, lambda seed: episode(-1 - seed % 2**31), "")
+    values = [objective.loss(model, part, torch.Generator())[1] for part in objective.batch(np.random.default_rng(0), count)]
     return {
         "held_out_loss": sum(value["answers"] for value in values),
         "held_out_exact": sum(value["exact"] for value in values),

@@ -25,7 +25,7 @@ from data.interface.failures import INVALID_OUTPUT
 from data.interface.observation import HistoryItem
 from data.interface.steps import PlanStep
 from sim.collection.demonstrations import accepted
-from sim.collection.text_world import TextWorld
+from sim.collection.text_world import TextWorld, feedback_text
 from sim.robots.spec import load_robot
 from sim.tasks.drafts import Draft, NoDraft, Scene
 from sim.tasks.families import CATEGORIES, FAMILIES, draw, family_of
@@ -38,7 +38,6 @@ __all__ = [
     "goal_question",
     "goal_questions_of_part",
     "play",
-    "play_alone",
     "text_planning_of_part",
 ]
 
@@ -112,15 +111,6 @@ def dagger_of_part(config: CollectConfig, part: int, student: Student) -> Iterat
     episodes = [_Episode(config, index, "dagger in text") for index in config.indices(part)]
     for episode in _side_by_side(episodes, student, chosen):
         yield from episode.rows
-
-
-def play_alone(config: CollectConfig, student: Student) -> list[TextEpisode]:
-    """Plays every episode of a collection side by side with a student that nobody helps; a reply without a step does nothing.
-
-    Measures what a planner makes of words alone, apart from the benchmark's tasks: for choosing between training recipes.
-    """
-    episodes = [_Episode(config, index, "held-out text planning") for index in range(config.count)]
-    return _side_by_side(episodes, student, lambda episode, target, proposed: proposed)
 
 
 def _side_by_side(
@@ -200,8 +190,7 @@ class _Episode:
             return
         outcomes = self.world.take(step)
         self.record.codes |= {str(code) for _, code in outcomes}
-        feedback = "; ".join(f"{action.to_text()} {code}" for action, code in outcomes)
-        self._history.append({"step": step.to_text(), "feedback": feedback})
+        self._history.append({"step": step.to_text(), "feedback": feedback_text(outcomes)})
 
     def close(self) -> TextEpisode:
         """The record, with whether the goals hold."""

@@ -23,7 +23,7 @@ from sim.expert.jobs import Job, plan_jobs
 from sim.robots.spec import RobotSpec
 from sim.tasks.drafts import Draft, Scene
 
-__all__ = ["TextWorld"]
+__all__ = ["TextWorld", "feedback_text"]
 
 _HEIGHT_STEP_M: Final = 0.05
 #: Pelvis heights relative to upright, metres.
@@ -51,6 +51,11 @@ _BEARINGS_DEG: Final = (-20.0, 20.0)
 _FREE_ARMS: Final = (Arm.RIGHT, Arm.LEFT)
 _MOVES: Final = tuple(name for name, spec in ACTIONS.items() if spec.kind is ActionKind.BODY and not spec.takes_object)
 _LEGS: Final = ("MoveUp", "MoveDown")
+
+
+def feedback_text(outcomes: Sequence[tuple[Action, str]]) -> str:
+    """What a log says of a step that `TextWorld.take` carried out."""
+    return "; ".join(f"{action.to_text()} {code}" for action, code in outcomes)
 
 
 class TextWorld:

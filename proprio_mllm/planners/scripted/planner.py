@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from data.interface.actions import ACTIONS, ActionKind
-from data.interface.belief import Belief
+from data.interface.belief import ARM_SPECIFIC, Belief
 from data.interface.bodies import Arm
 from data.interface.failures import FailureCode
 from data.interface.feedback import Feedback
@@ -44,8 +44,6 @@ _ASIDE_NAMES: Final = ("MoveBack", "MoveRight", "MoveLeft")
 _PATIENCE: Final = 16
 #: Codes after which the same thing may work when it is tried again.
 _BAD_LUCK: Final = (FailureCode.NOTHING_HAPPENED, FailureCode.LOCKED, FailureCode.SLIPPED, FailureCode.SPILLED)
-#: Codes after which the other arm may do what one could not.
-_ARM_SPECIFIC: Final = (FailureCode.OBSTRUCTED, FailureCode.GRASP_MISSED, FailureCode.HANDLE_SLIPPED)
 #: Codes that a better knowledge of the world answers: what comes next is another job.
 _KNOWLEDGE: Final = (
     FailureCode.ALREADY_IN_STATE,
@@ -188,8 +186,8 @@ class ScriptedPlanner:
             and True not in belief.at_limit
         ):
             return Action("MoveUp", amount=_RISES_M[0])  # over the edge
-        if last.code in _ARM_SPECIFIC and last.action.arm is not None and job.arm is None:
-            arms = {event.action.arm for event in failed if event.code in _ARM_SPECIFIC}
+        if last.code in ARM_SPECIFIC and last.action.arm is not None and job.arm is None:
+            arms = {event.action.arm for event in failed if event.code in ARM_SPECIFIC}
             if len(arms) == 1 and len(belief.state.free_arms()) == 2:
                 return None  # the other arm may
         return self._stance(job, belief)
