@@ -7,9 +7,12 @@ import re
 import numpy as np
 import pytest
 
+from data.interface.steps import PlanStep
+from proprio_mllm.evaluation import lessons
 from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.word_tokens import WordTokens, add_word_tokens
-from proprio_mllm.model.wording import id_words, text_words
+from proprio_mllm.model.wording import answer_words, id_words, text_words
+from sim.collection.text_world import TextWorld
 
 SEEDS = range(80)
 
@@ -27,6 +30,16 @@ def test_episodes_end_in_success(episodes: list) -> None:
 def test_an_episode_is_a_function_of_its_seed(episodes: list) -> None:
     assert Lessons().episode(5) == episodes[5]
     assert episodes[5] != episodes[6]
+
+
+def test_mistakes_are_taken_and_never_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
+    mistake = PlanStep.parse("RotateLeft(5)")
+    monkeypatch.setattr(lessons, "_MISTAKES", (0.5,))
+    monkeypatch.setattr(TextWorld, "mistake", lambda self, step: mistake)
+    words = answer_words("Pick", None, mistake)[3:-1]
+    turns = [turn for seed in range(12) for turn in Lessons().episode(seed).turns]
+    assert sum(turn.taken[1:3] == words for turn in turns) > 20
+    assert not any(turn.answer[-len(words) - 1 : -1] == words for turn in turns)
 
 
 def test_every_word_is_known_or_made_up(episodes: list) -> None:

@@ -66,6 +66,16 @@ def test_only_answers_are_learnt(model: ProprioMLLM) -> None:
             assert torch.equal(labels[places], ids[places + 1])
 
 
+def test_an_answer_is_learnt_from_its_first_word_to_its_last(model: ProprioMLLM) -> None:
+    for row in rows_of(Lessons().episode(7), WordTokens(model.processor.tokenizer)):
+        batch = collate([row], 0)
+        width = (batch.labels.shape[1] - batch.layout.log) // batch.layout.anchors.shape[1]
+        for index, (_, tokens, answer) in enumerate(row.branches):
+            labels = batch.labels[0, batch.layout.log + index * width :][:width]
+            assert labels[labels != -100].tolist() == tokens[answer:]
+            assert int((labels != -100).nonzero()[0]) == answer - 1
+
+
 def test_the_batch_depends_on_its_generator_alone(model: ProprioMLLM) -> None:
     objective = WordsObjective(model, Lessons().episode, "")
     one, two, other = (objective.batch(np.random.default_rng(seed), 4) for seed in (1, 1, 2))

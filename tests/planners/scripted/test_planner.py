@@ -151,6 +151,37 @@ def test_a_door_that_falls_shut_is_held() -> None:
     assert answer(put, [*lines, "Place(right, Drawer_1) ok", "Release(left) ok"], ["Mug_1"]) == "Done()"
 
 
+def test_a_held_door_is_let_go_of_and_tried_from_elsewhere_with_the_other_arm() -> None:
+    take = "Hold the drawer open with one hand, take the mug out, then let it fall shut."
+    assert answer(take, ["GoTo(Drawer_1) ok"]) == "Open(right, Drawer_1)"
+    lines = ["GoTo(Drawer_1) ok", "Open(right, Drawer_1) ok"]
+    assert answer(take, lines, ["Mug_1"]) == "Pick(left, Mug_1)"
+    lines += ["Pick(left, Mug_1) TooFar"]
+    assert answer(take, lines, ["Mug_1"]) == "Release(right)"
+    lines += ["Release(right) ok"]
+    assert answer(take, lines, ["Mug_1"]) == "GoTo(Drawer_1, auto, -20)"
+    assert answer(take, [*lines, "GoTo(Drawer_1, auto, -20) ok"], ["Mug_1"]) == "Open(left, Drawer_1)"
+
+
+def test_what_was_too_far_is_walked_to_before_it_is_tried_again() -> None:
+    both = "Hold the mug and the cup at the same time."
+    near = [
+        "GoTo(Cup_1) ok",
+        "Pick(left, Cup_1) TooFar; Pick(right, Mug_1) BodyTooHigh",
+        "MoveDown(0.1) ok",
+        "Pick(right, Mug_1) ok",
+    ]
+    assert answer(both, near, ["Mug_1", "Cup_1"]) == "GoTo(Cup_1)"
+
+
+def test_one_arm_after_the_other_then_another_stance() -> None:
+    pick, lines = "Pick up the mug.", ["GoTo(Mug_1) ok", "Pick(right, Mug_1) GraspMissed"]
+    assert answer(pick, lines, ["Mug_1"]) == "Pick(left, Mug_1)"
+    assert answer(pick, [*lines, "Pick(left, Mug_1) Obstructed"], ["Mug_1"]).startswith("GoTo(Mug_1")
+    lift = ["GoTo(Box_1) ok", "Lift(Box_1) GraspMissed"]
+    assert answer("Lift the box.", lift, ["Box_1"]).startswith("GoTo(Box_1")
+
+
 def test_what_rolls_away_is_held() -> None:
     lines = ["GoTo(Knife_1) ok", "Pick(right, Knife_1) ok", "GoTo(Apple_1) ok", "Slice(right, Apple_1) NeedsSteadying"]
     seen = ["Knife_1", "Apple_1"]

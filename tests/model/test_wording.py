@@ -1,0 +1,87 @@
+"""Episodes in words, written out by hand."""
+
+from __future__ import annotations
+
+import pytest
+
+from data.interface.observation import HistoryItem
+from data.interface.sightings import Sightings
+from data.interface.steps import PlanStep
+from proprio_mllm.evaluation.lessons import Shown
+from proprio_mllm.model.wording import answer_words, id_words, log_words, prefix_words, read_step, state_words
+
+ROOM = ("CounterTop_1", "TVStand_1", "Fridge_2")
+
+
+def told(*steps: tuple[str, str, tuple[str, ...], tuple[str, ...]]) -> Sightings:
+    """What has been seen after some steps: step, feedback, what is in view, what is known besides the room."""
+    sightings, history = Sightings(), []
+    sightings.look(Shown("Put the mug away.", "h1", (), ROOM))
+    for step, feedback, visible, known in steps:
+        history.append(HistoryItem(step, feedback))
+        sightings.look(Shown("Put the mug away.", "h1", visible, (*ROOM, *known), tuple(history)))
+    return sightings
+
+
+@pytest.mark.parametrize(
+    ("object_id", "words"), [("DiningTable_1", "dining table _1"), ("TVStand_2", "tv stand _2"), ("Mug_12", "mug _12")]
+)
+def test_ids(object_id: str, words: str) -> None:
+    assert " ".join(id_words(object_id)) == words
+
+
+def test_the_start() -> None:
+    words = prefix_words(Shown("Put the mug, please, on the counter.", "x1", (), ROOM))
+    assert " ".join(words) == "x1 put the mug , please , on the counter . room counter top _1 tv stand _1 fridge _2"
+
+
+def test_a_step_of_the_log() -> None:
+    item = HistoryItem("Pick(left, Mug_1) & Open(right, Fridge_2)", "Pick(left, Mug_1) ok; Open(right, Fridge_2) BodyTooHigh")
+    assert " ".join(log_words(item, ("Egg_1",))) == "did Pick left mug _1 ok Open right fridge _2 BodyTooHigh see egg _1"
+    walk = HistoryItem("GoTo(Mug_1, auto, -20)", "GoTo(Mug_1, auto, -20) NoFreePose")
+    assert " ".join(log_words(walk, ())) == "did GoTo mug _1 auto -20d NoFreePose"
+
+
+def test_what_is_known_now() -> None:
+    sightings = told(
+        ("GoTo(CounterTop_1)", "GoTo(CounterTop_1) ok", ("Mug_1", "Egg_1"), ("Mug_1", "Egg_1")),
+        ("Pick(left, Mug_1)", "Pick(left, Mug_1) ok", ("Egg_1",), ("Mug_1", "Egg_1")),
+        ("GoTo(Fridge_2)", "GoTo(Fridge_2) ok", ("Fridge_2",), ("Mug_1", "Egg_1")),
+        ("Open(right, Fridge_2)", "Open(right, Fridge_2) ok", ("Fridge_2",), ("Mug_1", "Egg_1")),
+        ("Place(left, Fridge_2)", "Place(left, Fridge_2) BodyTooHigh", ("Fridge_2",), ("Mug_1", "Egg_1")),
+        ("MoveDown(0.1)", "MoveDown(0.1) ok", ("Fridge_2",), ("Mug_1", "Egg_1")),
+    )
+    assert " ".join(state_words(sightings)) == (
+        "now left mug _1 right empty at fridge _2 see fridge _2 egg _1 from counter top _1 open fridge _2 "
+        "fail Place fridge _2 down low 0.10 do"
+    )
+
+
+def test_hands_and_places() -> None:
+    lifted = told(("Lift(Box_1)", "Lift(Box_1) ok", ("Box_1",), ("Box_1",)))
+    assert " ".join(state_words(lifted)) == "now both box _1 away see box _1 do"
+    placed = told(
+        ("Pick(right, Mug_1)", "Pick(right, Mug_1) ok", (), ("Mug_1",)),
+        ("Place(right, Fridge_2)", "Place(right, Fridge_2) ok", (), ("Mug_1",)),
+        ("Hold(left, Egg_1)", "Hold(left, Egg_1) ok", (), ("Mug_1", "Egg_1")),
+    )
+    assert " ".join(state_words(placed)) == "now left egg _1 steady right empty away see mug _1 on fridge _2 do"
+
+
+@pytest.mark.parametrize(
+    ("verb", "target", "step", "words"),
+    [
+        ("Pick", None, "GoTo(Fridge_2, 0.5, 30)", "Pick unseen do GoTo fridge _2 0.50 30d ."),
+        (
+            "Pick",
+            "Mug_1",
+            "Pick(left, Mug_1) & Open(right, Fridge_2)",
+            "Pick mug _1 do Pick left mug _1 & Open right fridge _2 .",
+        ),
+        ("Release", "", "Release(left)", "Release do Release left ."),
+    ],
+)
+def test_answers(verb: str, target: str | None, step: str, words: str) -> None:
+    written = answer_words(verb, target, PlanStep.parse(step))
+    assert " ".join(written) == words
+    assert read_step(written, {id_words(name): name for name in ("Mug_1", "Egg_1", "Fridge_2")}) == PlanStep.parse(step)
