@@ -96,12 +96,12 @@ class SymbolicState:
                 self._carry_out(effect, call)
 
     def let_go(self, arm: Arm) -> None:
-        """A hand lets go; a door with a spring falls shut."""
+        """A hand lets go; a door with a spring falls shut, or nearly so: nobody tells."""
         item, self.held[arm] = self.held[arm], None
         if item is not None:
             self.in_place.discard(item)
             if item in self.self_closing:
-                self.conditions[Condition.OPEN][item] = False
+                self.conditions[Condition.OPEN].pop(item, None)
 
     def _carry_out(self, effect: Effect, call: Call) -> None:
         target = call.object_id or ""

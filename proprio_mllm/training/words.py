@@ -30,8 +30,8 @@ __all__ = ["WordBatch", "WordsObjective", "collate", "held_out", "rows_of", "wor
 _TURNS: Final = 6
 _ROWS: Final = 8
 #: Lengths of logs and of branches, tokens. Few lengths: kernels are prepared anew for every shape. What is longer is left out.
-_LOGS: Final = (128, 256)
-_BRANCHES: Final = (40, 72)
+_LOGS: Final = (128, 320)
+_BRANCHES: Final = (48, 96)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ import numpy as np
 
 from data.interface.actions import ACTIONS, ActionKind, exclude_each_other, first_refusal
 from data.interface.bodies import Arm
-from data.interface.effects import Condition, PutDown
+from data.interface.effects import Condition, LetGo, PutDown
 from data.interface.failures import FailureCode
 from data.interface.steps import Action, PlanStep
 from sim.collection.text_facts import TextFacts
@@ -37,6 +37,8 @@ _FAR: Final = {"whole_body": 0.08, "per_arm": 0.33}
 #: How often a walk is blocked, and how often one to a chosen distance has no free end.
 _BLOCKED: Final = 0.05
 _NO_POSE: Final = 0.35
+#: How often a door with a spring does not fall quite shut.
+_AJAR: Final = {"whole_body": 0.05, "per_arm": 0.5}
 #: How far, up and down, the pelvis may be from the height at which a piece of furniture is reached best, metres.
 _BAND_M: Final = {"whole_body": (0.05, 0.2), "per_arm": (0.15, 0.4)}
 #: Codes that come back from the same stance every time.
@@ -292,9 +294,12 @@ class TextWorld:
         held = self.facts.lifted if action.arm is None else self.facts.held(action.arm)
         shut = self.facts.hidden
         before = {name for name in self.facts.objs if shut(name)}
+        let_shut = action.spec.has_effect(LetGo) and held in self.facts.state.self_closing
         self.facts.succeed(action, self._at or self._scene.surfaces[0])
         if action.spec.has_effect(PutDown) and held is not None:
             self._near.add(held)
+        if let_shut and held is not None:
+            self.facts.state.conditions[Condition.OPEN][held] = bool(self._rng.random() < _AJAR[self._solver])
         if self.facts.state.is_in(Condition.OPEN, target):
             inside = [name for name in self.facts.objs if name in before and not shut(name) and self._rng.random() < 0.8]
             self.seen.update(inside)

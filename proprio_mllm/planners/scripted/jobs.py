@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeGuard
 
 from data.interface.actions import ACTIONS, ActionKind, bringing_about
 from data.interface.belief import Belief
@@ -128,7 +128,8 @@ def next_jobs(wants: Sequence[Want], belief: Belief, known: Sequence[str]) -> li
         jobs += opening
     jobs += _carry(light, belief)
     if not moves:
-        jobs += [_change(want) for want in pending if want.kind == "closed"]
+        behind = {want.source for want in held}
+        jobs += [_change(want) for want in pending if want.kind == "closed" and want.obj not in behind]
     jobs = jobs or _heavy([want for want in moves if want not in light], belief)
     if not jobs or (len(jobs) == 1 and jobs[0].verb in ("ToggleOn", "ToggleOff", "Open", "Pick")):
         jobs = jobs + [job for want in held for job in _hold(want, belief)]
@@ -148,15 +149,23 @@ def _is_heavy(obj: str | None, spoken: Mention | None, belief: Belief) -> bool:
     return name in _BIG
 
 
-def _is_shut(place: str | None, belief: Belief) -> bool:
+def _is_shut(place: str | None, belief: Belief) -> TypeGuard[str]:
+    if place in belief.state.self_closing:  # no hand holds it: that was seen to before
+        return True
     return place is not None and not belief.state.conditions[Condition.OPEN].get(place, type_of(place) not in _SHUT)
+
+
+def _opening(door: str, belief: Belief) -> Job:
+    """Opening a door; one that falls shut and has not quite done so is closed first."""
+    ajar = door in belief.state.self_closing and belief.state.is_in(Condition.OPEN, door)
+    return Job("Close" if ajar else "Open", door)
 
 
 def _pick(obj: str | None, spoken: Mention | None, source: str | None, belief: Belief) -> Job:
     """Taking a thing, or the opening of what it is in."""
     place = belief.state.at.get(obj or "", source)
     if place is not None and _is_shut(place, belief) and ("Open", place) not in belief.never:
-        return Job("Open", place)
+        return _opening(place, belief)
     return Job("Pick", obj, None, spoken, place)
 
 
@@ -244,7 +253,7 @@ def _carry(light: Sequence[Want], belief: Belief) -> list[Job]:
     jobs = []
     for want in in_hand:
         if _is_shut(want.place, belief) and free:
-            jobs.append(Job("Open", want.place))
+            jobs.append(_opening(want.place, belief))
         else:
             jobs.append(Job("Place", want.place, belief.state.arm_with(want.obj)))
     return jobs
@@ -253,7 +262,7 @@ def _carry(light: Sequence[Want], belief: Belief) -> list[Job]:
 def _heavy(moves: Sequence[Want], belief: Belief) -> list[Job]:
     for want in moves:
         if _is_shut(want.place, belief):
-            return [Job("Open", want.place)]
+            return [_opening(want.place, belief)]
         return [Job("Lift", want.obj, None, want.spoken_obj, want.source)]
     return []
 
