@@ -197,7 +197,7 @@ class ScriptedPlanner:
         events = belief.last
         if events and events[0].about("GoTo", job.target) and not events[0].ok:
             return self._stance(job, belief)
-        if events and events[0].action.name == "Release" and belief.let_shut.get(job.target or ""):
+        if events and events[0].action.name == "Release" and belief.let_shut.get(job.target or "") and job.verb != "Close":
             return self._stance(job, belief)
         if events and events[0].action.name in _ASIDE_NAMES:
             return Action("GoTo", object_id=job.target)

@@ -148,7 +148,10 @@ def test_a_door_that_falls_shut_is_held() -> None:
     lines = ["GoTo(Mug_1) ok", "Pick(right, Mug_1) ok", "GoTo(Drawer_1) ok", "Open(left, Drawer_1) ok"]
     assert answer(put, lines, ["Mug_1"]) == "Place(right, Drawer_1)"
     assert answer(put, [*lines, "Place(right, Drawer_1) ok"], ["Mug_1"]) == "Release(left)"
-    assert answer(put, [*lines, "Place(right, Drawer_1) ok", "Release(left) ok"], ["Mug_1"]) == "Done()"
+    lines += ["Place(right, Drawer_1) ok", "Release(left) ok"]
+    assert answer(put, lines, ["Mug_1"]) in ("Close(left, Drawer_1)", "Close(right, Drawer_1)")  # it may stand ajar
+    assert answer(put, [*lines, "Close(left, Drawer_1) AlreadyInState"], ["Mug_1"]) == "Done()"
+    assert answer(put, [*lines, "Close(left, Drawer_1) ok"], ["Mug_1"]) == "Done()"
 
 
 def test_a_held_door_is_let_go_of_and_tried_from_elsewhere_with_the_other_arm() -> None:
