@@ -15,7 +15,7 @@ import numpy as np
 
 from data.interface.actions import ACTIONS, ActionKind, exclude_each_other, first_refusal
 from data.interface.bodies import Arm
-from data.interface.effects import Condition, LetGo, PutDown
+from data.interface.effects import Condition, PutDown
 from data.interface.failures import FailureCode
 from data.interface.steps import Action, PlanStep
 from sim.collection.text_facts import TextFacts
@@ -294,11 +294,10 @@ class TextWorld:
         held = self.facts.lifted if action.arm is None else self.facts.held(action.arm)
         shut = self.facts.hidden
         before = {name for name in self.facts.objs if shut(name)}
-        let_shut = action.spec.has_effect(LetGo) and held in self.facts.state.self_closing
         self.facts.succeed(action, self._at or self._scene.surfaces[0])
         if action.spec.has_effect(PutDown) and held is not None:
             self._near.add(held)
-        if let_shut and held is not None:
+        if held is not None and self.facts.state.is_in(Condition.OPEN, held) is None:  # a door that was let go of
             self.facts.state.conditions[Condition.OPEN][held] = bool(self._rng.random() < _AJAR[self._solver])
         if self.facts.state.is_in(Condition.OPEN, target):
             inside = [name for name in self.facts.objs if name in before and not shut(name) and self._rng.random() < 0.8]

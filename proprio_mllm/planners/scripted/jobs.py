@@ -164,7 +164,7 @@ def _opening(door: str, belief: Belief) -> Job:
 def _pick(obj: str | None, spoken: Mention | None, source: str | None, belief: Belief) -> Job:
     """Taking a thing, or the opening of what it is in."""
     place = belief.state.at.get(obj or "", source)
-    if place is not None and _is_shut(place, belief) and ("Open", place) not in belief.never:
+    if _is_shut(place, belief) and ("Open", place) not in belief.never:
         return _opening(place, belief)
     return Job("Pick", obj, None, spoken, place)
 
@@ -245,7 +245,7 @@ def _carry(light: Sequence[Want], belief: Belief) -> list[Job]:
     door_ahead = any(_is_shut(want.place, belief) for want in in_hand)
     if waiting and free and not door_ahead:
         shut = [want.place for want in waiting if _is_shut(want.place, belief)]
-        ajar = [door for door in shut if door is not None and door not in belief.state.self_closing]
+        ajar = [door for door in shut if door not in belief.state.self_closing]
         if ajar and not in_hand and len(waiting) > 1:
             return [Job("Open", ajar[0])]
         room = 1 if shut else len(free)
