@@ -9,10 +9,12 @@ import pytest
 
 from data.interface.steps import PlanStep
 from proprio_mllm.evaluation import lessons
-from proprio_mllm.evaluation.lessons import Lessons
+from proprio_mllm.evaluation.lessons import Lessons, WordsOnly
 from proprio_mllm.model.word_tokens import WordTokens, add_word_tokens
 from proprio_mllm.model.wording import answer_words, id_words, text_words
 from sim.collection.text_world import TextWorld
+from sim.tasks.families import FAMILIES
+from sim.tasks.sample import UNSEEN_TYPES
 
 SEEDS = range(80)
 
@@ -40,6 +42,16 @@ def test_mistakes_are_taken_and_never_learnt(monkeypatch: pytest.MonkeyPatch) ->
     turns = [turn for seed in range(12) for turn in Lessons().episode(seed).turns]
     assert sum(turn.taken[1:3] == words for turn in turns) > 20
     assert not any(turn.answer[-len(words) - 1 : -1] == words for turn in turns)
+
+
+def test_half_of_the_tasks_are_of_two_things_for_two_arms() -> None:
+    optional = [FAMILIES[WordsOnly(seed).task.family].category == "optional" for seed in range(200)]
+    assert 0.4 <= np.mean(optional) <= 0.6
+
+
+def test_things_that_pictures_leave_out_are_in_words(episodes: list) -> None:
+    words = {word for one in episodes for turn in one.turns for word in (*one.prefix, *turn.taken)}
+    assert all(set(id_words(f"{name}_1")) <= words for name in UNSEEN_TYPES)
 
 
 def test_every_word_is_known_or_made_up(episodes: list) -> None:

@@ -166,6 +166,15 @@ def test_a_held_door_is_let_go_of_and_tried_from_elsewhere_with_the_other_arm() 
     assert answer(take, [*lines, "GoTo(Drawer_1, auto, -20) ok"], ["Mug_1"]) == "Open(left, Drawer_1)"
 
 
+def test_a_door_that_stands_ajar_is_closed_before_it_is_opened_and_a_shut_one_left_alone_until_the_end() -> None:
+    take = "Hold the drawer open with one hand, take the mug out, then let it fall shut."
+    lines = ["GoTo(Drawer_1) ok", "Open(right, Drawer_1) AlreadyInState"]
+    assert answer(take, lines) == "Close(right, Drawer_1)"
+    assert answer(take, [*lines, "Close(right, Drawer_1) ok"]) == "Open(right, Drawer_1)"
+    missed = ["GoTo(Drawer_1) ok", "Open(right, Drawer_1) ok", "Release(right) ok", "GoTo(Drawer_1, auto, -20) ok"]
+    assert answer(take, missed) == "Open(left, Drawer_1)"
+
+
 def test_what_was_too_far_is_walked_to_before_it_is_tried_again() -> None:
     both = "Hold the mug and the cup at the same time."
     near = [

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 
 from configs.schema.collect import CollectConfig
@@ -14,8 +15,11 @@ from data.interface.actions import ACTIONS
 from data.interface.steps import Action, PlanStep
 from sim.collection.collect import rows_of_part
 from sim.collection.text_planning import TextEpisode, dagger_of_part, play
+from sim.collection.text_world import TextWorld
+from sim.robots.spec import load_robot
 from sim.scene.catalogue import load_catalogue
-from sim.tasks.families import FAMILIES
+from sim.tasks.families import FAMILIES, draw
+from sim.tasks.sample import scene_of
 
 #: Types that a hand picks up.
 SMALL = {kind.name for kind in load_catalogue().types.values() if kind.pickupable}
@@ -114,3 +118,17 @@ def test_what_a_student_picks_up_for_nothing_is_put_back() -> None:
         picked = re.match(r"Pick\(\w+, (\w+)\) ok", last)
         back += picked is not None and picked[1] not in row["named"] and row["target"].startswith(("Place", "GoTo"))
     assert back > 5
+
+
+@pytest.mark.parametrize(("robot", "low", "high"), [("h1", 0.0, 0.2), ("x1", 0.3, 0.7)])
+def test_a_door_with_a_spring_may_stay_ajar(robot: str, low: float, high: float) -> None:
+    found: list[bool] = []
+    for seed in range(150):
+        rng, scene = np.random.default_rng(seed), scene_of("kitchen_1")
+        world = TextWorld(draw("fetch_ajar", scene, rng), scene, load_robot(robot), rng)
+        (door,) = world.facts.state.self_closing
+        taken = [world.take(PlanStep.parse(text)) for text in (f"GoTo({door})", f"Open(left, {door})", "Release(left)")]
+        if taken[1][0][1] == "ok":
+            assert taken[2][0][1] == "ok"
+            found.append(world.facts.object(door).opened)
+    assert len(found) > 30 and low <= np.mean(found) <= high
