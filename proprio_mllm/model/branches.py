@@ -6,7 +6,11 @@ view. At run time one branch follows the log as ordinary text, with the same pos
 
 Paper: none; it is how the language model is trained.
 
-Shape letters: B rows, S = M + N * W tokens of a row, M tokens of the log, N branches of W tokens, H heads, D head dimension.
+Rows are padded for attention alone. Everything else of the language model runs over the tokens that are kept, in one line: half
+of a padded batch is padding.
+
+Shape letters: B rows, S = M + N * W tokens of a row, M tokens of the log, N branches of W tokens, H heads, D head dimension, T
+tokens of all rows without padding, filled up to a multiple of `_LINE` since kernels are prepared anew for every size.
 """
 
 from __future__ import annotations
@@ -14,17 +18,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import torch
 from torch import Tensor
+from torch.autograd import Function
+from torch.nn import functional
 from transformers.modeling_utils import ALL_ATTENTION_FUNCTIONS
 
 from proprio_mllm.model.batch import Movable
 
-__all__ = ["Branches", "branch_attention", "with_branches"]
+__all__ = ["Branches", "read_branches"]
 
-_NAME = "branches"
+_NAME: Final = "branches"
+_LINE: Final = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,60 +47,142 @@ class Branches(Movable):
     anchors: Tensor
 
 
-def branch_attention(
-    module: Any, query: Tensor, key: Tensor, value: Tensor, attention_mask: Branches, scaling: float, **_: Any
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """Where the tokens of padded rows are in the line of kept ones.
+
+    Attributes:
+        layout: of the rows.
+        slots: (T,) slot of each token of the line among the B * S; 0 for those that fill it up.
+        places: (B * S,) the token of each slot; the line's last one, which fills it up, for padding.
+        kept: tokens of the line that are of a row.
+    """
+
+    layout: Branches
+    slots: Tensor
+    places: Tensor
+    kept: int
+
+    @staticmethod
+    def of(layout: Branches, kept: Tensor) -> _Line:
+        """The line of rows whose kept tokens are told by a mask (B, S)."""
+        found = kept.flatten().nonzero()[:, 0]
+        count = len(found)
+        slots = functional.pad(found, (0, _LINE - count % _LINE))  # at least one fills it up
+        places = torch.full((kept.numel(),), len(slots) - 1, device=kept.device)
+        places[found] = torch.arange(count, device=kept.device)
+        return _Line(layout, slots, places, count)
+
+    def rows(self, line: Tensor) -> Tensor:
+        """(T, ...) of the line as (B, S, ...) of the rows."""
+        taken: Any = _Taken.apply(line, self.places, self.slots, self.kept)
+        return taken.unflatten(0, (len(self.layout.anchors), -1))
+
+    def line(self, rows: Tensor) -> Tensor:
+        """(B, S, ...) of the rows as (T, ...) of the line."""
+        taken: Any = _Taken.apply(rows.flatten(0, 1), self.slots, self.places, len(self.places))
+        return taken
+
+
+class _Taken(Function):
+    """Rows of a table by their numbers, where every row that matters is taken once: the gradient is a look-up as well.
+
+    Nothing is read of what pads a row or fills up the line, so their gradients are zero: the tokens behind `kept` are set so, and
+    padding looks up the last of them.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, taken: Tensor, inverse: Tensor, kept: int) -> Tensor:
+        ctx.save_for_backward(inverse)
+        ctx.kept = kept
+        return table[taken]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None, None]:
+        (inverse,) = ctx.saved_tensors
+        grad = grads[0][inverse]
+        grad[ctx.kept :] = 0.0
+        return grad, None, None, None
+
+
+def _attention(
+    module: Any, query: Tensor, key: Tensor, value: Tensor, attention_mask: _Line, scaling: float, **_: Any
 ) -> tuple[Tensor, None]:
     """Transformers' attention interface.
 
     Args:
         module: the attention layer.
-        query: (B, H, S, D).
-        key: (B, H / groups, S, D).
-        value: (B, H / groups, S, D).
-        attention_mask: the layout; Transformers passes on what it is given per kind of layer.
+        query: (1, H, T, D).
+        key: (1, H / groups, T, D).
+        value: (1, H / groups, T, D).
+        attention_mask: the line; Transformers passes on what it is given per kind of layer.
         scaling: of the scores.
 
     Returns:
-        (B, S, H, D), and no weights.
+        (1, T, H, D), and no weights.
     """
+    line = attention_mask
     groups = query.shape[1] // key.shape[1]
+    rows = [line.rows(one[0].transpose(0, 1).to(value.dtype)).transpose(1, 2) for one in (query * scaling, key, value)]
     if groups > 1:
-        key, value = key.repeat_interleave(groups, 1), value.repeat_interleave(groups, 1)
-    query, key = query.to(value.dtype), key.to(value.dtype)  # rotation leaves them wider
-    return _attend(query * scaling, key, value, attention_mask.log, attention_mask.anchors), None
+        rows[1:] = [one.repeat_interleave(groups, 1) for one in rows[1:]]
+    return line.line(_attend(*rows, line.layout.log, line.layout.anchors))[None], None
 
 
 def _attend(query: Tensor, key: Tensor, value: Tensor, m: int, anchors: Tensor) -> Tensor:
     """Attention of scaled queries (B, H, S, D): (B, S, H, D)."""
-    rows, heads, size, dim = query.shape
-    n = anchors.shape[1]
-    w = (size - m) // n
-    log_key, log_value = key[:, :, :m], value[:, :, :m]
-    scores = query[:, :, :m] @ log_key.mT  # (B, H, M, M)
-    future = torch.ones(m, m, dtype=torch.bool, device=query.device).triu(1)
-    out_log = _softmax(scores.masked_fill(future, -torch.inf)) @ log_value  # (B, H, M, D)
-
-    own_query = query[:, :, m:]  # (B, H, N * W, D)
-    behind = own_query @ log_key.mT  # (B, H, N * W, M)
-    unseen = torch.arange(m, device=query.device) >= anchors[:, :, None]  # (B, N, M)
-    behind = behind.unflatten(2, (n, w)).masked_fill(unseen[:, None, :, None], -torch.inf)  # (B, H, N, W, M)
-    folded = (rows, heads, n, w, dim)
-    own_key, own_value = key[:, :, m:].reshape(folded), value[:, :, m:].reshape(folded)
-    own = own_query.reshape(folded) @ own_key.mT  # (B, H, N, W, W)
-    own = own.masked_fill(torch.ones(w, w, dtype=torch.bool, device=query.device).triu(1), -torch.inf)
-    weights = _softmax(torch.cat([behind, own], -1))  # (B, H, N, W, M + W)
-    out = weights[..., :m].flatten(2, 3) @ log_value + (weights[..., m:] @ own_value).flatten(2, 3)  # (B, H, N * W, D)
-    return torch.cat([out_log, out], 2).transpose(1, 2)
+    n, device = anchors.shape[1], query.device
+    of_log = _weighted(query[:, :, :m], key[:, :, :m], value[:, :, :m], torch.ones(m, m, device=device).tril() > 0)
+    # branches are rows of their own (B * N, H, W, D), with the log's keys before theirs
+    own, behind = zip(*(_split(one, m, n) for one in (query, key, value)), strict=True)
+    w = own[0].shape[2]
+    seen = (torch.arange(m, device=device) < anchors.flatten()[:, None])[:, None, None].expand(-1, 1, w, -1)
+    past = (torch.ones(w, w, device=device).tril() > 0).expand(len(seen), 1, -1, -1)
+    keys, values = (torch.cat([behind[index], own[index]], 2) for index in (1, 2))
+    of_branches = _weighted(own[0], keys, values, torch.cat([seen, past], -1))  # (B * N, H, W, D)
+    rows = of_branches.unflatten(0, (-1, n)).transpose(2, 3).flatten(1, 2)  # (B, N * W, H, D)
+    return torch.cat([of_log.transpose(1, 2), rows], 1)
 
 
-def _softmax(scores: Tensor) -> Tensor:
-    return torch.softmax(scores, -1, dtype=torch.float32).to(scores.dtype)
+def _weighted(query: Tensor, key: Tensor, value: Tensor, seen: Tensor) -> Tensor:
+    """Attention where `seen` says so."""
+    unseen = torch.zeros_like(seen, dtype=query.dtype).masked_fill(~seen, -torch.inf)
+    return torch.softmax(query @ key.mT + unseen, -1) @ value
+
+
+def _split(rows: Tensor, m: int, n: int) -> tuple[Tensor, Tensor]:
+    """(B, H, S, D) as the branches (B * N, H, W, D), and the log once for each of them, (B * N, H, M, D)."""
+    own = rows[:, :, m:].unflatten(2, (n, -1)).transpose(1, 2).flatten(0, 1)
+    return own, rows[:, None, :, :m].expand(-1, n, -1, -1, -1).flatten(0, 1)
+
+
+def read_branches(text_model: Any, input_ids: Tensor, position_ids: Tensor, layout: Branches, kept: Tensor) -> Tensor:
+    """Last hidden states of rows with branches.
+
+    Args:
+        text_model: a language model of Transformers.
+        input_ids: (B, S).
+        position_ids: (B, S).
+        layout: where the branches are.
+        kept: (B, S) tokens that are no padding; of each log and each branch, the first ones.
+
+    Returns:
+        (B, S, hidden); what it holds of padding means nothing.
+    """
+    line = _Line.of(layout, kept)
+    with _own_attention(text_model):
+        hidden = text_model(
+            input_ids=input_ids.flatten()[line.slots][None],
+            attention_mask={"full_attention": line},
+            position_ids=position_ids.flatten()[line.slots][None],
+            use_cache=False,
+        )[0]
+    return line.rows(hidden[0])
 
 
 @contextmanager
-def with_branches(text_model: Any) -> Iterator[None]:
-    """Lets a language model attend along branches; inside, `attention_mask` is `{"full_attention": Branches}`."""
-    ALL_ATTENTION_FUNCTIONS.register(_NAME, branch_attention)
+def _own_attention(text_model: Any) -> Iterator[None]:
+    ALL_ATTENTION_FUNCTIONS.register(_NAME, _attention)
     config, before = text_model.config, text_model.config._attn_implementation
     config._attn_implementation = _NAME
     try:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from proprio_mllm.model.batch import IGNORE, Movable
-from proprio_mllm.model.branches import Branches, with_branches
+from proprio_mllm.model.branches import Branches, read_branches
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.word_tokens import WordTokens, first_word
 from proprio_mllm.model.wording import WordEpisode
@@ -139,14 +139,8 @@ def words_loss(model: ProprioMLLM, batch: WordBatch, reading: bool = False) -> W
         reading: whether to predict what is read, too.
     """
     core: Any = model.core
-    text: Any = core.model.language_model
-    with with_branches(text):
-        hidden = text(
-            input_ids=batch.input_ids,
-            attention_mask={"full_attention": batch.layout},
-            position_ids=batch.position_ids,
-            use_cache=False,
-        )[0]  # (B, S, D)
+    padding = batch.input_ids == int(model.processor.tokenizer.pad_token_id)
+    hidden = read_branches(core.model.language_model, batch.input_ids, batch.position_ids, batch.layout, ~padding)  # (B, S, D)
     first = first_word(model.processor.tokenizer)
     table = core.lm_head.weight[first:]  # words are the last tokens that were added, and all that is ever predicted here
     chosen = batch.labels != IGNORE
@@ -157,8 +151,7 @@ def words_loss(model: ProprioMLLM, batch: WordBatch, reading: bool = False) -> W
     read = logits.new_zeros(())
     if reading:
         following = batch.input_ids.roll(-1, 1)
-        pad = int(model.processor.tokenizer.pad_token_id)
-        told = (batch.input_ids != pad) & (following != pad) & ~chosen
+        told = ~padding & ~padding.roll(-1, 1) & ~chosen
         told[:, batch.layout.log - 1 :: _width(batch)] = False  # the last position of the log and of each branch
         read = functional.cross_entropy(functional.linear(hidden[told], table).float(), following[told] - first)
     return WordsLoss(functional.cross_entropy(logits, picked, reduction="sum"), read, right)

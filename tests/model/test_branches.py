@@ -10,7 +10,7 @@ from configs.compose import compose
 from configs.schema.train import TrainConfig
 from configs.validate import build
 from proprio_mllm.evaluation.lessons import Lessons
-from proprio_mllm.model.branches import with_branches
+from proprio_mllm.model.branches import read_branches
 from proprio_mllm.model.building import build_model, build_processor
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.word_tokens import WordTokens, add_word_tokens
@@ -33,13 +33,8 @@ def test_a_branch_reads_what_text_would(model: ProprioMLLM) -> None:
     text = model.core.model.language_model
     for row in rows:
         batch = collate([row], 0)
-        with torch.no_grad(), with_branches(text):
-            packed = text(
-                input_ids=batch.input_ids,
-                attention_mask={"full_attention": batch.layout},
-                position_ids=batch.position_ids,
-                use_cache=False,
-            )[0][0]
+        with torch.no_grad():
+            packed = read_branches(text, batch.input_ids, batch.position_ids, batch.layout, batch.input_ids != 0)[0]
         log, width = batch.layout.log, (batch.input_ids.shape[1] - batch.layout.log) // batch.layout.anchors.shape[1]
         for index, (anchor, tokens, _) in enumerate(row.branches):
             with torch.no_grad():
