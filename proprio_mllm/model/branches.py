@@ -87,7 +87,7 @@ class _Line:
 class _Taken(Function):
     """Rows of a table by their numbers, where every row that matters is taken once: the gradient is a look-up as well.
 
-    Nothing is read of what pads a row or fills up the line, so their gradients are zero: the tokens behind `kept` are set so, and
+    Nothing is read of what pads a row or fills up the line, so their gradients are zero: those behind `kept` are set so, and
     padding looks up the last of them.
     """
 

@@ -43,6 +43,25 @@ def test_a_branch_reads_what_text_would(model: ProprioMLLM) -> None:
             torch.testing.assert_close(packed[start : start + len(tokens)], plain, atol=2e-5, rtol=1e-4)
 
 
+def test_a_branch_is_learnt_from_as_text_would_be(model: ProprioMLLM) -> None:
+    text, words = model.core.model.language_model, WordTokens(model.processor.tokenizer)
+    rows = [row for seed in (7, 8) for row in rows_of(Lessons().episode(seed), words)][:4]  # padding, and rows without branches
+    batch = collate(rows, 0)
+    width = (batch.labels.shape[1] - batch.layout.log) // batch.layout.anchors.shape[1]
+    packed = plain = torch.zeros(())
+    hidden = read_branches(text, batch.input_ids, batch.position_ids, batch.layout, batch.input_ids != 0)
+    for number, row in enumerate(rows):
+        for index, (anchor, tokens, _) in enumerate(row.branches):
+            start = batch.layout.log + index * width
+            packed = packed + hidden[number, start : start + len(tokens), 0].sum()
+            plain = (
+                plain + text(input_ids=torch.tensor([[*row.log[:anchor], *tokens]]), use_cache=False)[0][0, anchor:, 0].sum()
+            )
+    parameters = [one for one in text.parameters() if one.requires_grad]
+    for one, other in zip(torch.autograd.grad(packed, parameters), torch.autograd.grad(plain, parameters), strict=True):
+        torch.testing.assert_close(one, other, atol=2e-4, rtol=1e-3)
+
+
 def test_every_learnt_decision_is_in_one_row(model: ProprioMLLM) -> None:
     episode = Lessons().episode(11)
     words = WordTokens(model.processor.tokenizer)
