@@ -3,7 +3,8 @@
     python -m benchmarks.words models=[weights/tiny/words] episodes=300
 
 Episodes are those of the lessons (`proprio_mllm.evaluation.lessons`) with seeds that training does not draw, so this is where
-recipes are compared. The teacher's own success stands in the last line. `insist=true` lets a model repeat what was refused.
+recipes are compared. The teacher's own success stands in the last line. `insist=true` lets a model take steps that are bound to
+be refused (`configs.schema.eval`).
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class Options:
         models: folders of stored models.
         episodes: how many.
         first: first seed; episode k has the seed -1 - first - k.
-        insist: whether what was refused twice may be repeated.
+        insist: whether steps may be taken that are bound to be refused.
     """
 
     models: tuple[str, ...] = ("weights/tiny/words",)
@@ -94,8 +95,7 @@ def main(arguments: Sequence[str]) -> int:
     torch.set_num_threads(1)
     seeds = [-1 - options.first - number for number in range(options.episodes)]
     for model in options.models:
-        planner = WordsPlanner.load(model)
-        planner.insist = options.insist
+        planner = WordsPlanner.load(model, insist=options.insist)
         episodes, started = [WordsOnly(seed) for seed in seeds], time.perf_counter()
         done = play(planner, episodes)
         sys.stdout.write(line(model, episodes, done, time.perf_counter() - started))

@@ -37,6 +37,7 @@ _OF_KINDS: Final[Mapping[str, tuple[PlannerKind, ...]]] = {
     "adapter": ("mllm",),
     "temperature": ("mllm",),
     "max_new_tokens": ("mllm",),
+    "insist": ("mllm",),
     "replans": (*CHAT_KINDS, "file"),
     "history": (*CHAT_KINDS, "file"),
     "body": (*CHAT_KINDS, "file"),
@@ -63,6 +64,8 @@ class PlannerConfig:
         train: command that makes the weights, for the message when they are absent.
         temperature: 0 takes the most likely token.
         max_new_tokens: longest reply.
+        insist: whether a model that plans from whole episodes may take steps that are bound to be refused by what its log tells
+            of hands and states, and a third time what was refused twice.
         image_size: side of the head view in pixels for `random`, `scripted` and `expert`, 0 for none; others bring their own,
             or have `backend.image_size`.
         reflection: `on` reflects on failures. Planners of a backend ask once more for cause, change and new steps; a stored
@@ -85,6 +88,7 @@ class PlannerConfig:
     train: str = ""
     temperature: float = 0.0
     max_new_tokens: int = 48
+    insist: bool = False
     image_size: int = 112
     reflection: Literal["on", "off"] = "on"
     replans: int = 5

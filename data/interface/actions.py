@@ -309,7 +309,7 @@ _TABLE: Final = (
             *need(_C.OBJECT_BROKEN, lambda s: not s.tool.broken),
             *need(_C.ALREADY_IN_STATE, lambda s: not s.tool.full),
             *need(_C.NOT_FILLABLE, lambda s: s.facts.outlet(s.target.object_id) is not None),
-            *need(_C.SOURCE_OFF, lambda s: s.facts.object(s.facts.outlet(s.target.object_id) or "").on),
+            *need(_C.SOURCE_OFF, lambda s: s.facts.object(s.facts.outlet(s.target.object_id) or "").on is not False),
         ),
         effects=(Become(Condition.FILLED, True, "tool"),),
         meets=(*_REACH, _C.POUR_MISSED, _C.SPILLED, *_NOTHING),

@@ -7,13 +7,14 @@ reference planner's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from data.interface.actions import ActionKind
+from data.interface.actions import ACTIONS, ActionKind, first_refusal
 from data.interface.bodies import Arm
 from data.interface.effects import Condition, Grasp, HoldOpen, LetGo, PutDown, Rise, Turn, Walk
+from data.interface.facts import Call
 from data.interface.failures import FailureCode
 from data.interface.observation import HistoryItem
 from data.interface.steps import Action
@@ -58,7 +59,7 @@ class Belief:
         unsteady: what has to be held under a tool.
         shut_away: objects in something closed.
         broken: broken objects.
-        never: (verb, id) that will never work.
+        never: (verb, id) that will never work, and why.
         fails: failures of (verb, id) since the last arm action that succeeded.
         stances: walks to an object since then.
         heights: changes of pelvis height at the present stance, metres, upwards positive.
@@ -78,7 +79,7 @@ class Belief:
     unsteady: set[str] = field(default_factory=set)
     shut_away: set[str] = field(default_factory=set)
     broken: set[str] = field(default_factory=set)
-    never: set[tuple[str, str]] = field(default_factory=set)
+    never: dict[tuple[str, str], FailureCode] = field(default_factory=dict)
     fails: dict[tuple[str, str], list[Event]] = field(default_factory=dict)
     stances: dict[str, int] = field(default_factory=dict)
     heights: list[float] = field(default_factory=list)
@@ -117,6 +118,17 @@ class Belief:
             return False
         condition, value = _DONE[kind]
         return self.state.is_in(condition, object_id) is value
+
+    def refusal(self, call: Call) -> FailureCode | None:
+        """The code with which an action is bound to be refused, None where nothing is known against it."""
+        if call.object_id is not None and (call.name, call.object_id) in self.never:
+            return self.never[call.name, call.object_id]
+        arm, door = self._opened or (None, None)  # whether it falls shut is not always told
+        spec = ACTIONS[call.name]
+        if (spec.has_effect(LetGo) and call.arm is arm) or (spec.has_effect(HoldOpen) and call.object_id == door):
+            return None
+        found = first_refusal(call, _Believed(self))
+        return None if found is None else found.code
 
     def failures(self, verb: str, target: str | None) -> list[Event]:
         """What went wrong with an action since the last success."""
@@ -197,4 +209,79 @@ class Belief:
         elif code == FailureCode.SOURCE_OFF:
             state.conditions[Condition.ON].clear()
         elif code in _NEVER:
-            self.never.add((action.name, target))
+            self.never[action.name, target] = FailureCode(code)
+
+
+@dataclass(frozen=True, slots=True)
+class _Thing:
+    """An object with which everything can be done that nothing is known against."""
+
+    object_id: str
+    holders: tuple[str, ...]
+    movable: bool
+    two_handed: bool
+    liftable: bool
+    opened: bool
+    closed: bool
+    on: bool | None
+    sliced: bool
+    soiled: bool
+    used_up: bool
+    broken: bool
+    filled: bool
+    shut: bool
+    full: bool = False
+    covered: bool = False
+    unsteady: bool = False
+    pickupable: bool = True
+    receptacle: bool = True
+    openable: bool = True
+    toggleable: bool = True
+    sliceable: bool = True
+    consumable: bool = True
+    fillable: bool = True
+    cutter: bool = True
+    wiper: bool = True
+
+
+class _Believed:
+    """A belief as the facts that requirements look at."""
+
+    def __init__(self, belief: Belief) -> None:
+        self._belief, self._state = belief, belief.state
+
+    def held(self, arm: Arm) -> str | None:
+        return self._state.held[arm]
+
+    @property
+    def lifted(self) -> str | None:
+        return self._state.lifted
+
+    def object(self, object_id: str) -> _Thing:
+        state, name = self._state, object_id
+        return _Thing(
+            object_id=name,
+            holders=tuple(arm.value for arm in Arm if name in (state.held[arm], state.lifted)),
+            movable=name not in state.self_closing,
+            two_handed=name in self._belief.heavy,
+            liftable=name not in self._belief.light,
+            opened=state.is_in(Condition.OPEN, name) is True,
+            closed=state.is_in(Condition.OPEN, name) is False,
+            shut=state.is_in(Condition.OPEN, name) is False,
+            on=state.is_in(Condition.ON, name),
+            sliced=state.is_in(Condition.SLICED, name) is True,
+            soiled=state.is_in(Condition.DIRTY, name) is not False,
+            used_up=state.is_in(Condition.USED_UP, name) is True,
+            filled=state.is_in(Condition.FILLED, name) is not False,
+            broken=name in self._belief.broken,
+        )
+
+    def carriers(self, object_id: str) -> Iterable[str]:
+        place = self._state.at.get(object_id)
+        return () if place is None else (place,)
+
+    def overload_kg(self, object_id: str, arms: int) -> float:
+        return -1.0
+
+    def outlet(self, object_id: str) -> str | None:
+        return object_id

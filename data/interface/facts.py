@@ -138,8 +138,8 @@ class ObjectFacts(Protocol):
         ...
 
     @property
-    def on(self) -> bool:
-        """Whether it is switched on."""
+    def on(self) -> bool | None:
+        """Whether it is switched on, None where that is not known."""
         ...
 
     @property

@@ -80,6 +80,10 @@ class SymbolicState:
         """The arm that holds an object."""
         return next((arm for arm, item in self.held.items() if item is not None and item == object_id), None)
 
+    def holds(self, object_id: str) -> bool:
+        """Whether an object is held up, by one hand or both; what is steadied where it rests is not."""
+        return object_id in (self.lifted, *self.held.values()) and object_id not in self.in_place
+
     def is_in(self, condition: Condition, object_id: str) -> bool | None:
         """Whether an object is in a state, None when that is not known."""
         return self.conditions[condition].get(object_id)

@@ -123,10 +123,12 @@ def _attention(
     """
     line = attention_mask
     groups = query.shape[1] // key.shape[1]
-    rows = [line.rows(one[0].transpose(0, 1).to(value.dtype)).transpose(1, 2) for one in (query * scaling, key, value)]
+    query, key, value = (
+        line.rows(one[0].transpose(0, 1).to(value.dtype)).transpose(1, 2) for one in (query * scaling, key, value)
+    )
     if groups > 1:
-        rows[1:] = [one.repeat_interleave(groups, 1) for one in rows[1:]]
-    return line.line(_attend(*rows, line.layout.log, line.layout.anchors))[None], None
+        key, value = key.repeat_interleave(groups, 1), value.repeat_interleave(groups, 1)
+    return line.line(_attend(query, key, value, line.layout.log, line.layout.anchors))[None], None
 
 
 def _attend(query: Tensor, key: Tensor, value: Tensor, m: int, anchors: Tensor) -> Tensor:

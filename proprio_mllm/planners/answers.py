@@ -6,11 +6,13 @@ Paper: none; its planners are free to answer anything. Constrained, every reply 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from data.interface.actions import ACTIONS, ActionKind, ActionSpec, Amount, exclude_each_other
+from data.interface.belief import Belief
 from data.interface.bodies import Arm
+from data.interface.effects import Grasp
 from data.interface.steps import Action
 from proprio_mllm.model.wording import END, id_words, number_words
 from proprio_mllm.planners.furniture import FIXTURES
@@ -27,10 +29,12 @@ class AnswerGrammar:
 
     Args:
         ids: known ids.
+        belief: what is known of the world; actions that are bound to be refused by it are left out. None leaves out none.
     """
 
-    def __init__(self, ids: Sequence[str]) -> None:
+    def __init__(self, ids: Sequence[str], belief: Belief | None = None) -> None:
         self.ids: Mapping[tuple[str, ...], str] = {id_words(name): name for name in ids}
+        self._belief = belief
 
     def allowed(self, words: Sequence[str]) -> list[str]:
         """The words that may follow some words of an answer; none after its end."""
@@ -40,8 +44,8 @@ class AnswerGrammar:
             spec = ACTIONS[words[0]]
             if not spec.takes_object or words[-1] == "unseen":
                 return ["do"]
-            following = self._of_ids(words[1:], spec, None)
-            return following + ["unseen"] * (len(words) == 1) if following else ["do"]
+            following = _next(words[1:], (one for one, name in self.ids.items() if self._may_be_wanted(spec, name)))
+            return [*following, "unseen"] if len(words) == 1 else following or ["do"]
         step = list(words[words.index("do") + 1 :])  # type: ignore[attr-defined]  # every sequence has index
         if step and step[-1] == END:
             return []
@@ -52,15 +56,14 @@ class AnswerGrammar:
 
     def _of_action(self, words: Sequence[str], first: Action | None) -> list[str]:
         if not words:
-            return [name for name, spec in ACTIONS.items() if first is None or spec.kind is ActionKind.ARM]
-        spec, rest = ACTIONS[words[0]], list(words[1:])
+            return [name for name, spec in ACTIONS.items() if any(True for _ in self._arms(spec, first))]
+        spec, rest, arm = ACTIONS[words[0]], list(words[1:]), None
         if spec.kind is ActionKind.ARM:
             if not rest:
-                return [arm.value for arm in Arm if first is None or arm is not first.arm]
-            rest.pop(0)
+                return [one.value for one in self._arms(spec, first) if one is not None]
+            arm = Arm(rest.pop(0))
         if spec.takes_object:
-            following = self._of_ids(rest, spec, first)
-            if following:
+            if following := _next(rest, self._targets(spec, arm, first)):
                 return following
             rest = rest[next(index for index, word in enumerate(rest) if word.startswith("_")) + 1 :]
         more = _numbers(spec.amounts[len(rest)]) if len(rest) < len(spec.amounts) else ()
@@ -73,24 +76,42 @@ class AnswerGrammar:
             after.append("&")
         return after
 
-    def _of_ids(self, begun: Sequence[str], spec: ActionSpec, first: Action | None) -> list[str]:
-        """The next words of ids that begin so; none when an id is complete."""
-        begun = tuple(begun)
-        if any(word.startswith("_") for word in begun):
-            return []
-        fitting = [
-            words
-            for words, name in self.ids.items()
-            if words[: len(begun)] == begun
-            and not (spec.name in _OF_MOVABLES and type_of(name) in FIXTURES)
-            and not (first is not None and exclude_each_other(first, Action(spec.name, arm=_other(first), object_id=name)))
-        ]
-        return list(dict.fromkeys(words[len(begun)] for words in fitting))
+    def _arms(self, spec: ActionSpec, first: Action | None) -> Iterator[Arm | None]:
+        """The arms that may do an action beside a first one; None for what is not an arm's, if it may be done."""
+        if first is not None and spec.kind is not ActionKind.ARM:
+            return
+        arms = (None,) if spec.kind is not ActionKind.ARM else tuple(Arm) if first is None else (_other(first),)
+        yield from (arm for arm in arms if any(True for _ in self._targets(spec, arm, first)))
+
+    def _targets(self, spec: ActionSpec, arm: Arm | None, first: Action | None) -> Iterator[tuple[str, ...]]:
+        """The words of what an action may be about; no words for an action that is about nothing."""
+        for words, name in self.ids.items() if spec.takes_object else (((), None),):
+            action = Action(spec.name, arm, name)
+            if name is not None and not self._may_be_wanted(spec, name):
+                continue
+            if first is not None and exclude_each_other(first, action):
+                continue
+            if self._belief is None or self._belief.refusal(action) is None:
+                yield words
+
+    def _may_be_wanted(self, spec: ActionSpec, name: str) -> bool:
+        """Whether an object is one for a verb, whatever the hands do now: furniture is not picked, nor what is held."""
+        if spec.name in _OF_MOVABLES and type_of(name) in FIXTURES:
+            return False
+        return self._belief is None or not spec.has_effect(Grasp) or not self._belief.state.holds(name)
 
     def _action(self, words: Sequence[str]) -> Action:
         spec, rest = ACTIONS[words[0]], list(words[1:])
         arm = Arm(rest.pop(0)) if spec.kind is ActionKind.ARM else None
         return Action(words[0], arm, self.ids[tuple(rest)] if spec.takes_object else None)
+
+
+def _next(begun: Sequence[str], ids: Iterator[tuple[str, ...]]) -> list[str]:
+    """The next words of ids that begin so; none when an id is complete."""
+    if any(word.startswith("_") for word in begun):
+        return []
+    size = len(begun)
+    return list(dict.fromkeys(words[size] for words in ids if words[:size] == tuple(begun)))
 
 
 @functools.cache

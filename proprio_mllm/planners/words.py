@@ -1,8 +1,8 @@
 """Plans with a model that reads whole episodes in words (`proprio_mllm.model.wording`).
 
 The episode's log is kept as it grows; before each answer comes the block of what is known now. Answers are held to the grammar
-of actions and to known ids, so no reply is invalid. A step that was refused twice from the same stance is not taken a third
-time: the model's second choice is.
+of actions and to known ids, so no reply is invalid. Steps that are bound to be refused are not taken, nor a third time what was
+refused twice from the same stance: the model's second choice is.
 
 Paper: the language model of Proprio-MLLM before it sees and feels.
 """
@@ -86,7 +86,7 @@ class WordsPlanner:
     Args:
         model: trained by `stage=words`, in evaluation mode.
         temperature: 0 takes the most likely word.
-        insist: whether steps that were refused twice may be repeated.
+        insist: whether steps may be taken that are bound to be refused, and repeated when they were refused twice.
     """
 
     privileged = False
@@ -99,14 +99,14 @@ class WordsPlanner:
         self._pad = int(self._tokenizer.pad_token_id)
 
     @staticmethod
-    def load(folder: str | Path, temperature: float = 0.0, train: str = "") -> WordsPlanner:
+    def load(folder: str | Path, temperature: float = 0.0, train: str = "", insist: bool = False) -> WordsPlanner:
         """Reads a stored model.
 
         Raises:
             WeightsError: when the folder has no model; the message names `train`, the command that makes it.
         """
         model = load_model(check_weights(folder, train))
-        return WordsPlanner(model.to("cuda") if torch.cuda.is_available() else model, temperature)
+        return WordsPlanner(model.to("cuda") if torch.cuda.is_available() else model, temperature, insist)
 
     def begin(self, task: TaskInfo, rng: np.random.Generator) -> WordsState:
         """The state of a new episode."""
@@ -126,7 +126,7 @@ class WordsPlanner:
         assert states is not None
         started = time.perf_counter()
         prompts = [state.look(one) for one, state in zip(observations, states, strict=True)]
-        answers = [_Answer(AnswerGrammar(one.known_objects), state) for one, state in zip(observations, states, strict=True)]
+        answers = [self._answer(one, state) for one, state in zip(observations, states, strict=True)]
         open_rows = list(range(len(answers)))
         for choice in range(_CHOICES):
             self._write([prompts[row] for row in open_rows], [answers[row] for row in open_rows])
@@ -142,10 +142,13 @@ class WordsPlanner:
             replies.append(PlannerReply(step.to_text(), step, tokens=len(prompt) + len(answer.words), latency_s=each_s))
         return replies
 
+    def _answer(self, observation: Seen, state: WordsState) -> _Answer:
+        return _Answer(AnswerGrammar(observation.known_objects, None if self.insist else state.sightings.belief), state)
+
     @torch.no_grad()
     def _write(self, prompts: Sequence[Sequence[int]], answers: Sequence[_Answer]) -> None:
         """Continues every answer to its end."""
-        rows = [[*prompt, *answer.tokens] for prompt, answer in zip(prompts, answers, strict=True)]
+        rows = [[*prompt, *answer.begun()] for prompt, answer in zip(prompts, answers, strict=True)]
         if len(rows) == 1:
             self._write_one(rows[0], answers[0])
             return
@@ -206,17 +209,28 @@ class _Answer:
     def __init__(self, grammar: AnswerGrammar, state: WordsState) -> None:
         self._grammar, self.state = grammar, state
         self.words: list[str] = []
-        self.tokens: list[int] = []
+        self._tokens: list[list[int]] = []
+        self._rest: list[int] = []
         self._margins: list[float] = []
         self._forbidden: dict[Words, set[str]] = {}
 
+    def begun(self) -> list[int]:
+        """Its tokens so far."""
+        return [token for tokens in self._tokens for token in tokens]
+
     def choose(self, scores: Tensor, temperature: float) -> int | None:
-        """Takes the next word by the scores (V,) of tokens; its token, None when the answer has ended."""
+        """Takes the next word by the scores (V,) of tokens.
+
+        Returns:
+            Its first token, or the next one of a word under way; None when the answer has ended.
+        """
+        if self._rest:
+            return self._rest.pop(0)
         options = [word for word in self._grammar.allowed(self.words) if word not in self._forbidden.get(tuple(self.words), ())]
         if not options:
             return None
-        tokens = [self.state.words.tokens([word])[0] for word in options]
-        values = scores[tokens]
+        tokens = [self.state.words.tokens([word]) for word in options]
+        values = scores[[first for first, *_ in tokens]]
         if temperature > 0.0:
             index = int(torch.multinomial((values / temperature).softmax(-1), 1, generator=self.state.generator))
         else:
@@ -224,8 +238,9 @@ class _Answer:
         others = values[torch.arange(len(options)) != index]
         self._margins.append(float(values[index] - others.max()) if len(options) > 1 else float("inf"))
         self.words.append(options[index])
-        self.tokens.append(tokens[index])
-        return tokens[index]
+        self._tokens.append(tokens[index])
+        first, *self._rest = tokens[index]
+        return first
 
     def step(self) -> PlanStep:
         """The step of a finished answer."""
@@ -242,5 +257,5 @@ class _Answer:
         if self._margins[place] == float("inf"):
             return False
         self._forbidden.setdefault(tuple(self.words[:place]), set()).add(self.words[place])
-        del self.words[place:], self.tokens[place:], self._margins[place:]
+        del self.words[place:], self._tokens[place:], self._margins[place:]
         return True

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from data.interface.actions import ACTIONS
+from data.interface.belief import Belief
+from data.interface.observation import HistoryItem
 from data.interface.steps import PlanStep
 from proprio_mllm.model.wording import END, answer_words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
@@ -47,6 +49,45 @@ def test_every_step_can_be_said_and_is_read_back(text: str) -> None:
 )
 def test_what_cannot_be_done_cannot_be_said(text: str) -> None:
     assert not said(answer_words("Pick", "Mug_1", PlanStep.parse(text)), AnswerGrammar(IDS))
+
+
+@pytest.mark.parametrize(
+    ("text", "held"),
+    [
+        ("Pick(left, Zubo_1)", "Mug_1 in that hand"),
+        ("Pick(right, Mug_1)", "Mug_1 in the other one"),
+        ("Place(right, DiningTable_1)", "nothing in that one"),
+        ("Place(left, DiningTable_1) & Place(right, DiningTable_1)", "nothing in the second one"),
+    ],
+)
+def test_what_is_bound_to_be_refused_cannot_be_said(text: str, held: str) -> None:
+    words = answer_words("Pick", "Zubo_1", PlanStep.parse(text))
+    belief = Belief.of([HistoryItem("Pick(left, Mug_1)", "Pick(left, Mug_1) ok")])
+    assert said(words, AnswerGrammar(IDS)), held
+    assert not said(words, AnswerGrammar(IDS, belief)), held
+
+
+def test_what_is_held_is_not_wanted_in_a_hand() -> None:
+    belief = Belief.of([HistoryItem("Pick(left, Mug_1)", "Pick(left, Mug_1) ok")])
+    assert AnswerGrammar(IDS, belief).allowed(["Pick"]) == ["zubo", "unseen"]
+    assert "mug" in AnswerGrammar(IDS, belief).allowed(["Clean"])
+
+
+def test_what_is_wanted_need_not_have_been_seen() -> None:
+    assert AnswerGrammar(["Fridge_1"]).allowed(["Pick"]) == ["unseen"]
+
+
+@pytest.mark.parametrize(
+    "log", [(), ("Pick(left, Mug_1) ok",), ("Open(left, Fridge_1) ok", "GoTo(Fridge_1) InUse"), ("Lift(Zubo_1) ok",)]
+)
+def test_whatever_may_be_done_can_be_said_to_its_end(log: tuple[str, ...]) -> None:
+    belief = Belief.of([HistoryItem(line.rpartition(" ")[0], line) for line in log])
+    rng, grammar = np.random.default_rng(0), AnswerGrammar(IDS, belief)
+    for _ in range(100):
+        words: list[str] = []
+        while options := grammar.allowed(words):
+            words.append(options[int(rng.integers(len(options)))])
+        assert [belief.refusal(action) for action in read_step(words, grammar.ids).actions] in ([None], [None, None])
 
 
 def test_whatever_is_said_is_a_step() -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -90,6 +92,20 @@ def test_registry() -> None:
     assert isinstance(make_planner(PlannerConfig("r", "random", "R", image_size=56)), Planner)
     with pytest.raises(ValueError, match=r"'expert' is not made here; allowed: file, mllm, random, scripted"):
         make_planner(PlannerConfig("e", "expert", "E"))
+
+
+@pytest.mark.parametrize(
+    ("weights", "settings", "allowed"),
+    [
+        ("words", {"reflection": "off"}, "reads whole episodes; allowed: 'on'"),
+        ("words", {"max_new_tokens": 20}, "reads whole episodes; allowed: 48"),
+        ("words", {"adapter": "base"}, "reads whole episodes; allowed: None"),
+        ("base", {"insist": True}, "reads a prompt of its own at every step; allowed: False"),
+    ],
+)
+def test_settings_that_a_model_would_ignore_are_refused(weights: str, settings: dict[str, Any], allowed: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(allowed)):
+        make_planner(PlannerConfig("m", "mllm", "M", weights=f"weights/tiny/{weights}", **settings))
 
 
 def test_weights_are_checked(tmp_path: Path) -> None:

@@ -13,11 +13,14 @@ from configs.compose import compose
 from configs.schema.train import TrainConfig
 from configs.validate import build
 from data.interface.observation import HistoryItem
-from proprio_mllm.evaluation.lessons import Lessons, WordsOnly
+from data.interface.steps import PlanStep
+from proprio_mllm.evaluation.lessons import Lessons, Shown, WordsOnly
 from proprio_mllm.model.building import build_model, build_processor, save_model
 from proprio_mllm.model.word_tokens import add_word_tokens
+from proprio_mllm.model.wording import answer_words
+from proprio_mllm.planners.answers import AnswerGrammar
 from proprio_mllm.planners.protocol import TaskInfo, WeightsError
-from proprio_mllm.planners.words import WordsPlanner, plans_in_words
+from proprio_mllm.planners.words import WordsPlanner, _Answer, plans_in_words
 from proprio_mllm.training.pipeline import base_model_config
 
 INFO = TaskInfo("", "h1", 20)
@@ -84,6 +87,27 @@ def test_what_was_refused_twice_is_not_insisted_on(planner: WordsPlanner) -> Non
     second = answer({first: 2})
     assert second != first
     assert answer({first: 2, second: 2}) not in (first, second)
+
+
+def test_names_that_end_like_plurals_are_written_as_they_are_read(planner: WordsPlanner) -> None:
+    shown = Shown("put the zubos on the kafus", "h1", (), ("Zubos_1", "Kafus_1"))
+    states = [begin(planner) for _ in range(3)]
+    hot = WordsPlanner(planner.model, temperature=5.0)
+    for _ in range(4):
+        for reply, alone in zip(hot.step_batch([shown] * 3, states), states, strict=True):
+            assert reply.step is not None
+            assert {one.object_id for one in reply.step.actions} <= {None, "Zubos_1", "Kafus_1"}
+            assert alone.words.tokens(["zubos"]) == [alone.words.tokens(["zubo"])[0], alone.words.known["s"]]
+    state, known = begin(planner), planner.model.processor.tokenizer
+    answer = _Answer(AnswerGrammar(shown.known_objects), state)
+    prompt, wanted = state.look(shown), answer_words("GoTo", "Zubos_1", PlanStep.parse("GoTo(Zubos_1)"))
+    written: list[int] = []
+    expected = state.words.tokens(wanted)
+    while (token := answer.choose(torch.eye(len(known))[expected[min(len(written), len(expected) - 1)]], 0.0)) is not None:
+        written.append(token)
+    assert prompt
+    assert written == expected == answer.begun()
+    assert answer.step() == PlanStep.parse("GoTo(Zubos_1)")
 
 
 def test_refusals_are_counted_until_something_succeeds(planner: WordsPlanner) -> None:
