@@ -12,10 +12,10 @@ from typing import Final
 from data.interface.actions import ACTIONS, ActionKind, ActionSpec, Amount, exclude_each_other
 from data.interface.belief import Belief
 from data.interface.bodies import Arm
-from data.interface.effects import Grasp
+from data.interface.effects import Condition, Grasp, Walk
 from data.interface.steps import Action
 from proprio_mllm.model.wording import END, id_words, number_words
-from proprio_mllm.planners.furniture import FIXTURES
+from proprio_mllm.planners.furniture import CONTAINERS, FIXTURES, SEATS, SURFACES
 from proprio_mllm.planners.scripted.words import type_of
 
 __all__ = ["AnswerGrammar"]
@@ -29,12 +29,16 @@ class AnswerGrammar:
 
     Args:
         ids: known ids.
-        belief: what is known of the world; actions that are bound to be refused by it are left out. None leaves out none.
+        belief: what is known of the world; actions that are bound to be refused by it are left out, and walks in search of
+            something to where it was looked for. None leaves out none.
     """
 
     def __init__(self, ids: Sequence[str], belief: Belief | None = None) -> None:
         self.ids: Mapping[tuple[str, ...], str] = {id_words(name): name for name in ids}
         self._belief = belief
+        places = [name for name in ids if type_of(name) in (*SURFACES, *SEATS, *CONTAINERS)]
+        self._searched = frozenset() if belief is None else _searched(places, belief)
+        self._searching = False
 
     def allowed(self, words: Sequence[str]) -> list[str]:
         """The words that may follow some words of an answer; none after its end."""
@@ -46,6 +50,7 @@ class AnswerGrammar:
                 return ["do"]
             following = _next(words[1:], (one for one, name in self.ids.items() if self._may_be_wanted(spec, name)))
             return [*following, "unseen"] if len(words) == 1 else following or ["do"]
+        self._searching = words[1] == "unseen"
         step = list(words[words.index("do") + 1 :])  # type: ignore[attr-defined]  # every sequence has index
         if step and step[-1] == END:
             return []
@@ -91,6 +96,8 @@ class AnswerGrammar:
                 continue
             if first is not None and exclude_each_other(first, action):
                 continue
+            if self._searching and name in self._searched and spec.has_effect(Walk):
+                continue
             if self._belief is None or self._belief.refusal(action) is None:
                 yield words
 
@@ -112,6 +119,13 @@ def _next(begun: Sequence[str], ids: Iterator[tuple[str, ...]]) -> list[str]:
         return []
     size = len(begun)
     return list(dict.fromkeys(words[size] for words in ids if words[:size] == tuple(begun)))
+
+
+def _searched(places: Sequence[str], belief: Belief) -> frozenset[str]:
+    """The places to which one need not go to look for something: none once all have been visited."""
+    seen = {name for name in places if name in belief.visited}
+    closed = {name for name in seen if type_of(name) in CONTAINERS and belief.state.is_in(Condition.OPEN, name) is not True}
+    return frozenset(seen - closed if len(seen) < len(places) else ())
 
 
 @functools.cache

@@ -73,6 +73,19 @@ def test_what_is_held_is_not_wanted_in_a_hand() -> None:
     assert "mug" in AnswerGrammar(IDS, belief).allowed(["Clean"])
 
 
+def test_what_is_not_seen_is_looked_for_where_one_has_not_been() -> None:
+    log = ["GoTo(DiningTable_1) ok", "GoTo(Fridge_1) ok", "GoTo(DiningTable_2) BlockedPath"]
+    belief = Belief.of([HistoryItem(line.rpartition(" ")[0], line) for line in log])
+    grammar = AnswerGrammar(IDS, belief)
+    search, fetch = ["Pick", "unseen", "do", "GoTo"], ["Pick", "mug", "_1", "do", "GoTo"]
+    assert grammar.allowed([*search, "dining", "table"]) == ["_2"]
+    assert "fridge" in grammar.allowed(search)  # it has not been opened
+    assert grammar.allowed([*fetch, "dining", "table"]) == ["_1", "_2"]
+    assert AnswerGrammar(IDS).allowed([*search, "dining", "table"]) == ["_1", "_2"]
+    everywhere = Belief.of([HistoryItem(f"GoTo({name})", f"GoTo({name}) ok") for name in IDS])
+    assert AnswerGrammar(IDS, everywhere).allowed([*search, "dining", "table"]) == ["_1", "_2"]
+
+
 def test_what_is_wanted_need_not_have_been_seen() -> None:
     assert AnswerGrammar(["Fridge_1"]).allowed(["Pick"]) == ["unseen"]
 
