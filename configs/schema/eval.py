@@ -65,7 +65,8 @@ class PlannerConfig:
         temperature: 0 takes the most likely token.
         max_new_tokens: longest reply.
         insist: whether a model that plans from whole episodes may take steps that are bound to be refused by what its log tells
-            of hands and states, look for something where it has been, and take a third time what was refused twice.
+            of hands and states, look for something where it has been, end the task with a step that did nothing, and take a
+            third time what was refused twice.
         image_size: side of the head view in pixels for `random`, `scripted` and `expert`, 0 for none; others bring their own,
             or have `backend.image_size`.
         reflection: `on` reflects on failures. Planners of a backend ask once more for cause, change and new steps; a stored

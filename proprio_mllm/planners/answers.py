@@ -29,8 +29,9 @@ class AnswerGrammar:
 
     Args:
         ids: known ids.
-        belief: what is known of the world; actions that are bound to be refused by it are left out, and walks in search of
-            something to where it was looked for. None leaves out none.
+        belief: what is known of the world; left out are actions that are bound to be refused by it, walks in search of
+            something to where it was looked for, and the end of the task unless hands have just done something. None leaves
+            out none.
     """
 
     def __init__(self, ids: Sequence[str], belief: Belief | None = None) -> None:
@@ -98,8 +99,12 @@ class AnswerGrammar:
                 continue
             if self._searching and name in self._searched and spec.has_effect(Walk):
                 continue
-            if self._belief is None or self._belief.refusal(action) is None:
+            if self._belief is None or (self._belief.refusal(action) is None and self._may_come_now(spec)):
                 yield words
+
+    def _may_come_now(self, spec: ActionSpec) -> bool:
+        assert self._belief is not None
+        return spec.kind is not ActionKind.EPISODE or any(event.ok and event.action.spec.arms for event in self._belief.last)
 
     def _may_be_wanted(self, spec: ActionSpec, name: str) -> bool:
         """Whether an object is one for a verb, whatever the hands do now: furniture is not picked, nor what is held."""

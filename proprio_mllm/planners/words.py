@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 from transformers import DynamicCache
 
+from data.interface.effects import Walk
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
 from data.interface.sightings import Seen, Sightings
@@ -51,7 +52,7 @@ class WordsState:
         log: tokens of prefix and log.
         cache: keys and values of the first `cached` of them.
         cached: how many.
-        refused: how often each step was refused since the last one that succeeded.
+        refused: how often each step was refused, or walked to where one stood, since the last one that changed something.
     """
 
     words: WordTokens
@@ -73,8 +74,11 @@ class WordsState:
         return self.log + self.words.tokens(state_words(self.sightings))
 
     def _count(self, observation: Seen) -> None:
-        last = observation.history[-1]
-        if any(event.ok for events in events_of([last]) for event in events):
+        before, last = [None, *observation.history][-2:]
+        assert last is not None
+        done = [event.action for events in events_of([last]) for event in events if event.ok]
+        again = before is not None and before.step == last.step and not self.sightings.new
+        if done and not (again and done[0].spec.has_effect(Walk)):
             self.refused.clear()
         else:
             self.refused[last.step] = self.refused.get(last.step, 0) + 1
@@ -86,7 +90,7 @@ class WordsPlanner:
     Args:
         model: trained by `stage=words`, in evaluation mode.
         temperature: 0 takes the most likely word.
-        insist: whether steps may be taken that are bound to be refused, and repeated when they were refused twice.
+        insist: whether steps may be taken that are bound to bring nothing (`AnswerGrammar`), or were refused twice.
     """
 
     privileged = False

@@ -86,6 +86,17 @@ def test_what_is_not_seen_is_looked_for_where_one_has_not_been() -> None:
     assert AnswerGrammar(IDS, everywhere).allowed([*search, "dining", "table"]) == ["_1", "_2"]
 
 
+@pytest.mark.parametrize(
+    ("last", "ends"), [("Pick(left, Mug_1) ok", True), ("Pick(left, Mug_1) Slipped", False), ("GoTo(Mug_1) ok", False)]
+)
+def test_a_task_ends_with_what_hands_have_done(last: str, ends: bool) -> None:
+    belief = Belief.of(
+        [HistoryItem("Pick(right, Zubo_1)", "Pick(right, Zubo_1) ok"), HistoryItem(last.rpartition(" ")[0], last)]
+    )
+    assert ("Done" in AnswerGrammar(IDS, belief).allowed(["Place", "zubo", "_1", "do"])) is ends
+    assert "Done" in AnswerGrammar(IDS).allowed(["Place", "zubo", "_1", "do"])
+
+
 def test_what_is_wanted_need_not_have_been_seen() -> None:
     assert AnswerGrammar(["Fridge_1"]).allowed(["Pick"]) == ["unseen"]
 

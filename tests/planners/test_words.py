@@ -112,13 +112,14 @@ def test_names_that_end_like_plurals_are_written_as_they_are_read(planner: Words
 
 def test_refusals_are_counted_until_something_succeeds(planner: WordsPlanner) -> None:
     shown, state = WordsOnly(3).shown(), begin(planner)
-    lines = ("Pick(left, Mug_1) TooFar", "Pick(left, Mug_1) TooFar", "GoTo(Mug_1) ok", "Pick(left, Mug_1) TooFar")
+    pick, walk = "Pick(left, Mug_1)", "GoTo(Mug_1)"
+    lines = (f"{pick} TooFar", f"{pick} TooFar", f"{walk} ok", f"{walk} ok", f"{walk} ok", f"{pick} TooFar", f"{pick} ok")
     history = tuple(HistoryItem(line.rsplit(" ", 1)[0], line) for line in lines)
     counts = []
     for count in range(len(lines) + 1):
         state.look(dataclasses.replace(shown, history=history[:count]))
         counts.append(dict(state.refused))
-    assert counts == [{}, {"Pick(left, Mug_1)": 1}, {"Pick(left, Mug_1)": 2}, {}, {"Pick(left, Mug_1)": 1}]
+    assert counts == [{}, {pick: 1}, {pick: 2}, {}, {walk: 1}, {walk: 2}, {walk: 2, pick: 1}, {}]
 
 
 def test_a_stored_model_is_known_by_its_configuration(planner: WordsPlanner, tmp_path: Path) -> None:
