@@ -18,6 +18,7 @@ from gymnasium import spaces
 
 from data.interface.bodies import DEFAULT_ROBOT, KEY_BODIES
 from data.interface.episode import STEP_LIMIT
+from data.interface.failures import INVALID_OUTPUT
 from data.interface.observation import Observation
 from data.interface.steps import ActionError, PlanStep
 from data.motion import N_FEATURES
@@ -129,7 +130,7 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
             "instruction": self._last.instruction,
             "visible_objects": self._last.visible_objects,
             "known_objects": self._last.known_objects,
-            "feedback": self._last.history[-1].feedback if self._last.history else "",
+            "feedback": INVALID_OUTPUT if error else self._last.history[-1].feedback if self._last.history else "",
             "invalid_action": error,
             "goals": self._session.goal_status(),
             "in_time": self._session.stats.charged + self._invalid <= self._session.task.time_limit,

@@ -1,4 +1,4 @@
-"""Video of an episode: `python -m sim video out=pick.mp4 robot=h1 plan='[GoTo(Mug_1), "Pick(left, Mug_1)"]'`.
+"""Video of an episode: `python -m sim video out=open.mp4 robot=h1 plan='[GoTo(Microwave_1), "Open(left, Microwave_1)"]'`.
 
 Frames are taken between control ticks while skills run, so motion is smooth; the step and what became of it are written below.
 With `task=ID` and no plan the expert acts. The file is written under a temporary name and renamed when it is complete. Encoding
@@ -23,6 +23,7 @@ from PIL import Image, ImageDraw, ImageFont
 from configs.arguments import command, read_arguments
 from configs.validate import ConfigError
 from data.interface.bodies import DEFAULT_ROBOT
+from data.interface.feedback import Feedback
 from data.interface.steps import ActionError, PlanStep
 from sim.expert.expert import Expert
 from sim.session.session import FreePlay, Session, TaskLike
@@ -171,11 +172,12 @@ def _task(config: VideoConfig) -> TaskLike:
     return tasks[config.task]
 
 
-def film(config: VideoConfig) -> tuple[int, bool]:
+def film(config: VideoConfig) -> tuple[int, tuple[str, ...]]:
     """Plays an episode and films it.
 
     Returns:
-        The number of frames, and whether every step (or the task, with an expert) succeeded.
+        The number of frames, and what failed: steps with their codes; with an expert, whose failures are part of its way, the
+        task where its goals do not hold in the end.
 
     Raises:
         ConfigError: on an unknown task.
@@ -186,31 +188,34 @@ def film(config: VideoConfig) -> tuple[int, bool]:
     task = _task(config)
     session = Session(config.robot, config.difficulty, image_size=0)
     session.reset(task, config.seed)
-    fine = True
+    failed: list[str] = []
     with VideoRecorder(session, config.out, config.cameras, config.size, config.fps, config.pretty) as video:
         if plan:
             for step in plan:
-                fine &= _act(session, step, video)
+                feedback = _act(session, step, video)
+                failed += [] if feedback.success else [feedback.to_text()]
         else:
             expert = Expert(session)
             expert.reset()
             while not session.finished:
                 _act(session, expert.next_step(), video)
-            fine = session.succeeded
+            failed += [] if session.succeeded else [task.id]
     session.close()
-    return video.frames, fine
+    return video.frames, tuple(failed)
 
 
-def _act(session: Session, step: PlanStep, video: VideoRecorder) -> bool:
+def _act(session: Session, step: PlanStep, video: VideoRecorder) -> Feedback:
     _, feedback = session.step(step)
     video.hold(_HOLD_S, feedback.to_text())
-    return feedback.success
+    return feedback
 
 
 @command(ActionError, ValueError)
 def main(arguments: Sequence[str]) -> int:
     """Command line; returns 0 when every step succeeded, 1 when one failed, 2 on wrong arguments."""
     config = read_arguments(VideoConfig, arguments)
-    frames, fine = film(config)
-    sys.stdout.write(f"{config.out}: {frames} frames, {frames / config.fps:.1f} s{'' if fine else ', a step failed'}\n")
-    return 0 if fine else 1
+    frames, failed = film(config)
+    sys.stdout.write(
+        f"{config.out}: {frames} frames, {frames / config.fps:.1f} s{'; failed: ' * bool(failed)}{', '.join(failed)}\n"
+    )
+    return 1 if failed else 0

@@ -31,6 +31,7 @@ NEEDS = {
     "qwen2_5_vl": ("backend.model=folder", "workers=0"),
     "internvl2_5": ("backend.model=folder", "workers=0"),
     "backend/vllm": ("backend.model=model",),
+    "file": ("planner.source=examples/own_planner.py:Nearby",),
     "backend/scripted": ("backend.source=answers.py:answer",),
 }
 ALL = sorted(path.relative_to(CONFIG_DIR) for path in CONFIG_DIR.rglob("*.yaml"))

@@ -24,3 +24,12 @@ def test_results_notebook(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) 
         o for cell in notebook.cells if cell.cell_type == "code" for o in cell.outputs if "image/png" in o.get("data", {})
     ]
     assert len(pictures) == 2
+
+
+def test_without_a_run_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RUN_DIR", raising=False)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    notebook = nbformat.read(ROOT / "notebooks" / "results.ipynb", as_version=4)
+    client = nbclient.NotebookClient(notebook, timeout=60, resources={"metadata": {"path": str(tmp_path)}})
+    with pytest.raises(nbclient.exceptions.CellExecutionError, match="make one first, for instance with `make eval`"):
+        client.execute()

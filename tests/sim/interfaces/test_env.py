@@ -35,6 +35,7 @@ def test_text_actions(env):
     assert (reward, done, truncated) == (0.0, False, False)
     _, _, done, truncated, info = env.step("RotateLeft(30)")
     assert info["feedback"] == "RotateLeft(30) ok" and not done and not truncated
+    assert env.step("dance")[-1]["feedback"] == "InvalidOutput"
     _, _, done, truncated, _ = env.step("RotateRight(30)")
     assert truncated and not done
     assert env.render().shape == (480, 480, 3)

@@ -25,6 +25,12 @@ def test_a_step_is_filmed_smoothly(tmp_path: Path, capsys: pytest.CaptureFixture
     assert [item.name for item in path.parent.iterdir()] == ["walk.mp4"]
 
 
+def test_what_failed_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    steps = 'plan=["GoTo(Unicorn_1)", "RotateLeft(5)"]'
+    assert main([f"out={tmp_path / 'a.mp4'}", steps, "cameras=[head]", "size=16", "fps=1"]) == 1
+    assert capsys.readouterr().out.endswith("; failed: GoTo(Unicorn_1) ObjectNotKnown\n")
+
+
 def test_a_film_that_is_broken_off_leaves_nothing(tmp_path: Path) -> None:
     session = Session("x1", image_size=0)
     session.reset(FreePlay("bathroom_1"), 0)
