@@ -199,7 +199,7 @@ def film(config: VideoConfig) -> tuple[int, tuple[str, ...]]:
             expert.reset()
             while not session.finished:
                 _act(session, expert.next_step(), video)
-            failed += [] if session.succeeded else [task.id]
+            failed += [] if session.succeeded else [config.task or config.room]
     session.close()
     return video.frames, tuple(failed)
 
