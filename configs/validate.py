@@ -12,11 +12,13 @@ import types
 from collections.abc import Iterable, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 __all__ = ["ConfigError", "allowed_values", "build"]
 
 T = TypeVar("T")
+#: Longest list of allowed values that is printed whole.
+_LISTED: Final = 60
 
 
 class ConfigError(ValueError):
@@ -27,7 +29,8 @@ def allowed_values(value: object, allowed: Iterable[object]) -> str:
     """The second half of a message that refuses a value: what is allowed, and the nearest of it to what was given."""
     names = [str(name) for name in allowed]
     near = difflib.get_close_matches(str(value), names, n=1, cutoff=0.6)
-    return f"allowed: {', '.join(names) or 'none'}" + (f"; did you mean {near[0]!r}?" if near else "")
+    listed = names if len(names) <= _LISTED else (*names[:5], f"… ({len(names)} in all)")
+    return f"allowed: {', '.join(listed) or 'none'}" + (f"; did you mean {near[0]!r}?" if near else "")
 
 
 def build(cls: type[T], values: Mapping[str, Any], where: str = "") -> T:

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from configs.validate import allowed_values
 from data.interface.actions import ACTIONS, ActionKind
 from data.interface.bodies import Arm
 from data.interface.steps import Action
@@ -95,7 +96,7 @@ def to_action(name: str, arguments: Mapping[str, Any]) -> Action:
     """
     target = ALIASES.get(name.lower())
     if target is None:
-        raise ValueError(f"unknown action {name!r}; allowed: {', '.join(sorted(set(ALIASES)))}")
+        raise ValueError(f"unknown action {name!r}; {allowed_values(name.lower(), sorted(set(ALIASES)))}")
     unknown = sorted(map(str, set(arguments) - set(ARGUMENTS)))
     if unknown:
         raise ValueError(f"{name}: unknown arguments {unknown}; allowed: {', '.join(ARGUMENTS)}")

@@ -13,10 +13,11 @@ GetInteractablePoses, SetObjectPoses, InitialRandomSpawn.
 
 from __future__ import annotations
 
+import textwrap
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +97,49 @@ class Event:
     color_to_object_id: dict[tuple[int, int, int], str] = field(default_factory=dict)
     third_party_camera_frames: list[NDArray[np.uint8]] = field(default_factory=list)
 
+    def __repr__(self) -> str:
+        """What was done, what became of it, what the hands hold and what is in view."""
+        told = self.metadata
+        held = ", ".join(f"{arm} {hand['heldObject'] or 'empty'}" for arm, hand in told.get("arm", {}).items())
+        seen = [entry["objectId"] for entry in told.get("objects", ()) if entry.get("visible")]
+        lines = (
+            f"Event of {told.get('lastAction')}: {'ok' if told.get('lastActionSuccess') else told.get('errorMessage')}",
+            f"hands: {held}",
+            f"in view: {', '.join(seen) or 'nothing'}",
+            f"frame {self.frame.shape}, metadata: {', '.join(told)}",
+        )
+        return "\n".join(textwrap.shorten(line, 240, placeholder=" …") for line in lines)
+
+    def raise_for_failure(self) -> Event:
+        """The event itself, when its action succeeded.
+
+        Raises:
+            RuntimeError: otherwise, with code and reason.
+        """
+        if not self.metadata["lastActionSuccess"]:
+            told = self.metadata
+            raise RuntimeError(f"{told['lastAction']}: {told.get('failureCode') or 'failed'}: {told.get('errorMessage', '')}")
+        return self
+
+    @property
+    def cv2img(self) -> NDArray[np.uint8]:
+        """(H, W, 3) frame, blue first, as OpenCV has it."""
+        return np.ascontiguousarray(self.frame[..., ::-1])
+
+    @property
+    def object_id_to_color(self) -> dict[str, tuple[int, int, int]]:
+        """Colour of each object in the segmentation."""
+        return {name: color for color, name in self.color_to_object_id.items()}
+
+    @property
+    def instance_detections2D(self) -> dict[str, tuple[int, int, int, int]]:  # noqa: N802 - AI2-THOR's name
+        """Box of each visible object: left, top, right, bottom, pixels, the last two beyond it."""
+        found = {name: np.argwhere(mask) for name, mask in self.instance_masks.items()}
+        return {
+            name: (int(at[:, 1].min()), int(at[:, 0].min()), int(at[:, 1].max()) + 1, int(at[:, 0].max()) + 1)
+            for name, at in found.items()
+        }
+
     @property
     def instance_masks(self) -> dict[str, NDArray[np.bool_]]:
         """(H, W) mask per visible object."""
@@ -104,7 +148,23 @@ class Event:
         return {name: mask for name, mask in masks.items() if mask.any()}
 
 
-class Controller:
+class Stopped:
+    """A controller that a `with` block stops."""
+
+    def __enter__(self) -> Self:
+        """The controller."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Stops it."""
+        self.stop()
+
+    def stop(self) -> None:
+        """Frees what it holds."""
+        raise NotImplementedError
+
+
+class Controller(Stopped):
     """Drives a session action by action.
 
     Args:
@@ -175,19 +235,24 @@ class Controller:
         self._redo.clear()
         self._saved = {}
 
-    def step(self, action: str | Mapping[str, Any] | None = None, **arguments: Any) -> Event:
+    def step(self, action: str | Mapping[str, Any] | None = None, raise_for_failure: bool = False, **arguments: Any) -> Event:
         """Executes an action, or two arm actions in parallel or one after the other.
 
         Args:
             action: an action name, or a mapping with `action` and arguments, or DualTHOR's `{"actions": [a, b],
                 "executionMode": "parallel"}`.
+            raise_for_failure: whether an action that fails raises an error.
             arguments: arguments of the action, see `sim.interfaces.aliases.ARGUMENTS`.
 
         Raises:
             ValueError: on an unknown action, argument or execution mode, or TP without privilege.
+            RuntimeError: as `raise_for_failure` says.
         """
         call: dict[str, Any] = dict(action) if isinstance(action, Mapping) else {"action": action}
-        call |= arguments
+        event = self._step(call | arguments)
+        return event.raise_for_failure() if raise_for_failure else event
+
+    def _step(self, call: dict[str, Any]) -> Event:
         if "actions" in call:
             return self._several(call)
         name = str(call.pop("action", ""))[:80]

@@ -29,6 +29,7 @@ from data.interface.failures import FailureCode
 from data.interface.feedback import ActionOutcome
 from data.interface.steps import Action, PlanStep
 from sim.interfaces.aliases import to_action
+from sim.interfaces.controller import Stopped
 from sim.interfaces.poses import interactable_poses
 from sim.session.session import FreePlay, Session, SessionSnapshot
 from sim.skills.locomotion import best_stance
@@ -59,7 +60,7 @@ _REACH_CODES: Final = (FailureCode.TOO_FAR, FailureCode.OBSTRUCTED, FailureCode.
 Reply = dict[str, Any]
 
 
-class Controller:
+class Controller(Stopped):
     """DualTHOR's controller.
 
     Args:

@@ -4,6 +4,8 @@ For users of reinforcement-learning tooling; the evaluation uses `sim.session.se
 the textual grammar of `data.interface.steps` (`Pick(left, Mug_1) & Open(right, Fridge_1)`). Text outside the grammar changes
 nothing, costs a step and is reported in `info`. Paper: DualTHOR as an environment; the reward is ours (share of goal
 conditions that hold, 1 at success).
+
+`gym.make("sim.interfaces.env:DualTHOR-v0", robot="x1")` makes one with Gymnasium's checker around it.
 """
 
 from __future__ import annotations
@@ -135,3 +137,7 @@ class DualThorEnv(gym.Env[dict[str, Any], str]):
             "goals": self._session.goal_status(),
             "in_time": self._session.stats.charged + self._invalid <= self._session.task.time_limit,
         }
+
+
+if "DualTHOR-v0" not in gym.registry:
+    gym.register("DualTHOR-v0", entry_point=DualThorEnv)  # type: ignore[arg-type]  # a class is a callable that makes it

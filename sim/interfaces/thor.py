@@ -129,7 +129,7 @@ def _matrix_from_thor(rotation: Mapping[str, Any]) -> Array:
     return (ry @ rx @ rz)[np.ix_((0, 2, 1), (0, 2, 1))]
 
 
-class Controller:
+class Controller(own.Stopped):
     """AI2-THOR's controller.
 
     Args:
@@ -203,18 +203,23 @@ class Controller:
         """Frees the drawing contexts."""
         self._own.stop()
 
-    def step(self, action: str | Mapping[str, Any] | None = None, **arguments: Any) -> Event:
+    def step(self, action: str | Mapping[str, Any] | None = None, raise_for_failure: bool = False, **arguments: Any) -> Event:
         """Executes one of AI2-THOR's actions.
 
         Args:
             action: its name, or a mapping with `action` and arguments.
+            raise_for_failure: whether an action that fails raises an error.
             arguments: of the action.
 
         Raises:
             ValueError: on an unknown action or argument, or one of another type.
+            RuntimeError: as `raise_for_failure` says.
         """
         call: dict[str, Any] = dict(action) if isinstance(action, Mapping) else {"action": action}
-        call |= arguments
+        event = self._step(call | arguments)
+        return event.raise_for_failure() if raise_for_failure else event
+
+    def _step(self, call: dict[str, Any]) -> Event:
         name = str(call.pop("action", ""))[:80]
         call.pop("agentId", None)
         if name in REFUSED:
@@ -328,10 +333,10 @@ class Controller:
             way = next(ways, None)
             if way is None:
                 break
-            event = self._own.step("GoTo", objectId=choices[0].object_id, **way)
+            event = self._own.step({"action": "GoTo", "objectId": choices[0].object_id, **way})
             if event.metadata["failureCode"] == FailureCode.BLOCKED_PATH:  # room to turn in
                 self._own.step("MoveBack", amount=_BACK_M)
-                self._own.step("GoTo", objectId=choices[0].object_id, **way)
+                self._own.step({"action": "GoTo", "objectId": choices[0].object_id, **way})
         return self._possible(choices)
 
     def _stand_before(self, choices: Sequence[Action]) -> Action:

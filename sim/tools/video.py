@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from configs.arguments import command, read_arguments
-from configs.validate import ConfigError
+from configs.validate import ConfigError, allowed_values
 from data.interface.bodies import DEFAULT_ROBOT
 from data.interface.feedback import Feedback
 from data.interface.steps import ActionError, PlanStep
@@ -168,7 +168,7 @@ def _task(config: VideoConfig) -> TaskLike:
         return FreePlay(config.room, instruction=config.room.replace("_", " "))
     tasks = {task.id: task for task in load_benchmark()}
     if config.task not in tasks:
-        raise ConfigError(f"unknown task {config.task!r}; allowed: {', '.join(tasks)}")
+        raise ConfigError(f"unknown task {config.task!r}; {allowed_values(config.task, tuple(tasks))}")
     return tasks[config.task]
 
 

@@ -8,7 +8,7 @@ import urllib.request
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sim.interfaces.controller import Event
+from sim.interfaces.controller import Event, Stopped
 from sim.interfaces.remote.protocol import IMAGES, decode_event, dumps
 
 __all__ = ["RemoteController", "RemoteError"]
@@ -18,7 +18,7 @@ class RemoteError(RuntimeError):
     """The server cannot be reached or does not answer as expected; the message says what it said."""
 
 
-class RemoteController:
+class RemoteController(Stopped):
     """Drives a world of a server.
 
     Args:
@@ -49,23 +49,23 @@ class RemoteController:
         self._world: str | None = opened["world"]
         self.last_event = decode_event(opened["event"])
 
-    def step(self, action: str | Mapping[str, Any] | None = None, **arguments: Any) -> Event:
+    def step(self, action: str | Mapping[str, Any] | None = None, raise_for_failure: bool = False, **arguments: Any) -> Event:
         """As `Controller.step`.
 
         Raises:
             ValueError: as there.
-            RemoteError: when the world is gone or the server cannot be reached.
+            RuntimeError: as there; RemoteError when the world is gone or the server cannot be reached.
         """
         call: dict[str, Any] = dict(action) if isinstance(action, Mapping) else {"action": action}
         call |= arguments
         answer = self._ask("POST", f"/worlds/{self._world}/step", call | {"images": self._images})
         self.last_event = decode_event(answer["event"])
-        return self.last_event
+        return self.last_event.raise_for_failure() if raise_for_failure else self.last_event
 
     def reset(self, scene: str | None = None, seed: int | None = None) -> Event:
         """As `Controller.reset`."""
         chosen = {key: value for key, value in (("scene", scene), ("seed", seed)) if value is not None}
-        return self.step("Reset", **chosen)
+        return self.step({"action": "Reset", **chosen})
 
     def stop(self) -> None:
         """Closes the world; a world that is gone already is no error."""

@@ -16,7 +16,7 @@ from typing import Final
 import yaml
 
 from configs.assets import asset_files
-from configs.validate import ConfigError, build
+from configs.validate import ConfigError, allowed_values, build
 from sim.scene.catalogue import Catalogue, Part, load_catalogue
 
 __all__ = ["ROOMS_PATH", "DefaultObject", "Furniture", "Room", "load_room", "room_names"]
@@ -122,7 +122,7 @@ def load_room(name: str) -> Room:
     """
     files = asset_files("rooms", ROOMS_PATH)
     if name not in files:
-        raise ValueError(f"unknown room {name!r}; allowed: {', '.join(sorted(files))}")
+        raise ValueError(f"unknown room {name!r}; {allowed_values(name, sorted(files))}")
     return _read(files[name], load_catalogue())
 
 

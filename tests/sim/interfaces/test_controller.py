@@ -26,6 +26,46 @@ def test_first_event_has_what_users_expect(controller):
     assert {"agent", "arm", "inventoryObjects", "objects", "sceneBounds"} <= set(event.metadata)
 
 
+def test_an_event_tells_itself_in_a_few_lines(controller):
+    told = repr(controller.step("Pick", objectId="Sofa_1"))
+    assert len(told.splitlines()) == 4 and len(told) < 1000
+    assert told.startswith("Event of Pick: Pick(right, Sofa_1): ")
+    assert "in view: " in told and "hands: left empty, right empty" in told
+
+
+def test_events_have_what_opencv_and_detectors_take(controller):
+    event = controller.reset()
+    assert np.array_equal(event.cv2img[..., 0], event.frame[..., 2])
+    for name, (left, top, right, bottom) in event.instance_detections2D.items():
+        inside = event.instance_masks[name][top:bottom, left:right]
+        assert inside.sum() == event.instance_masks[name].sum() and inside[0].any() and inside[:, -1].any()
+        assert (event.instance_segmentation_frame[event.instance_masks[name]] == event.object_id_to_color[name]).all()
+    assert event.instance_detections2D
+
+
+def test_failures_raise_where_that_is_asked_for(controller):
+    controller.reset()
+    assert controller.step("RotateLeft", degrees=5, raise_for_failure=True).metadata["lastActionSuccess"]
+    with pytest.raises(RuntimeError, match="GoTo: ObjectNotKnown: "):
+        controller.step("GoTo", objectId="Unicorn_1", raise_for_failure=True)
+
+
+def test_a_block_stops_its_controller():
+    with Controller("h1", width=16, height=16) as inside:
+        stopped = inside.session.close
+        closed = []
+        inside.session.close = lambda: closed.append(stopped())
+    assert closed == [None]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "near"), [({"action": "gotoo"}, "goto"), ({"action": "Reset", "scene": "kitchn_1"}, "kitchen_1")]
+)
+def test_what_was_meant_is_suggested(controller, wrong, near):
+    with pytest.raises(ValueError, match=f"did you mean '{near}'"):
+        controller.step(wrong)
+
+
 def test_undo_and_redo_are_exact(controller):
     controller.reset()
     session = controller.session

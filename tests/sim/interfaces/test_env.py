@@ -26,6 +26,16 @@ def test_check_env():
     made.close()
 
 
+def test_gymnasium_makes_it_by_name():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        made = gym.make("sim.interfaces.env:DualTHOR-v0", robot="x1", image_size=16)
+        observation, info = made.reset(seed=0)
+        assert observation["image"].shape == (16, 16, 3) and info["feedback"] == ""
+        assert made.step("RotateLeft(5)")[-1]["feedback"] == "RotateLeft(5) ok"
+        made.close()
+
+
 def test_text_actions(env):
     observation, info = env.reset(seed=3)
     assert env.observation_space.contains(observation)
