@@ -221,7 +221,8 @@ class ModelConfig:
         dtype: parameter type.
         history: earlier steps shown to the planner.
         episodes: whether it plans from whole episodes in words (`proprio_mllm.model.wording`) in place of prompts.
-        proprioception: whether prompts carry motion tokens.
+        sees: whether a picture stands before each answer of whole episodes; prompts always have one.
+        proprioception: whether prompts, or answers of whole episodes that have a picture, carry motion tokens.
     """
 
     name: str
@@ -229,6 +230,7 @@ class ModelConfig:
     image_size: int = 112
     prompt: Literal["terse", "full"] = "terse"
     episodes: bool = False
+    sees: bool = False
     vocab_size: int = 1400
     dtype: Literal["float32", "bfloat16"] = "float32"
     history: int = 4

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from configs.schema.model import ModelConfig
 from data.interface.observation import Camera
-from proprio_mllm.model.chat import Message, encode
+from proprio_mllm.model.chat import Encoded, Message, encode
 from proprio_mllm.model.geometry import centroid
 from proprio_mllm.model.mpe import Centroid, position_ids
 from proprio_mllm.model.processor import ProprioProcessor
@@ -49,10 +49,24 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A conversation and its views, in the order of the messages' images."""
+    """A conversation, or a sequence that is tokens already, and its views in the order of its images.
 
-    messages: tuple[Message, ...]
+    Attributes:
+        messages: the conversation; none where there are tokens.
+        views: one per image.
+        tokens: the sequence, one pad per image.
+        start: position of its first token, where what stands before it has been read already.
+    """
+
+    messages: tuple[Message, ...] = ()
     views: tuple[View, ...] = ()
+    tokens: Encoded | None = None
+    start: int = 0
+
+    @property
+    def length(self) -> int:
+        """Characters or tokens, to tell long ones from short ones."""
+        return sum(len(message.text) for message in self.messages) if self.tokens is None else len(self.tokens.ids)
 
 
 class Movable:
@@ -176,7 +190,7 @@ class Collator:
             examples: conversations.
             count: number of parts, at most one per two examples.
         """
-        ordered = sorted(examples, key=lambda example: sum(len(message.text) for message in example.messages))
+        ordered = sorted(examples, key=lambda example: example.length)
         count = max(1, min(count, len(ordered) // 2))
         cuts = [len(ordered) * number // count for number in range(count + 1)]
         return tuple(self(ordered[first:end]) for first, end in pairwise(cuts))
@@ -204,16 +218,17 @@ class Collator:
         rows: list[tuple[list[int], list[int], Tensor]] = []
         first = 0
         for number, example in enumerate(examples):
-            named = sum(m.images for m in example.messages)
+            encoded = example.tokens or encode(self.tokenizer, example.messages, generation)
+            named = encoded.ids.count(self.image_token)
             if named != len(example.views):
-                raise ValueError(f"example {number}: messages name {named} images, but it has {len(example.views)} views")
-            encoded = encode(self.tokenizer, example.messages, generation)
+                raise ValueError(f"example {number} names {named} images, but it has {len(example.views)} views")
             ids, labels = self._expand(encoded.ids, encoded.targets, images.grid if images else (0, 0))
             if len(ids) > self.max_tokens:
                 raise ValueError(f"example {number} has {len(ids)} tokens; at most {self.max_tokens} are allowed")
             places = images.centroids[first : first + named] if images else ()
             grids = [images.grid] * named if images else []
-            rows.append((ids, labels, position_ids(ids, self.image_token, grids, places, self.cfg.mpe.mode)))
+            where = position_ids(ids, self.image_token, grids, places, self.cfg.mpe.mode, example.start)
+            rows.append((ids, labels, where))
             first += named
         return self._pad(rows, images, side)
 

@@ -17,7 +17,7 @@ import torch
 from peft import PeftModel
 from torch import Tensor, nn
 from torch.nn import functional
-from transformers import Qwen2_5_VLForConditionalGeneration
+from transformers import Cache, Qwen2_5_VLForConditionalGeneration
 from transformers.modeling_outputs import BaseModelOutputWithPooling
 
 from configs.schema.model import ModelConfig
@@ -176,6 +176,20 @@ class ProprioMLLM(nn.Module):
         correct = int((logits.detach().argmax(-1) == picked).sum()) if count else 0
         everything = self.core.lm_head(hidden) if return_logits else None
         return ModelOutput(loss, count, correct, visual, everything)
+
+    @torch.no_grad()
+    def following(self, batch: Batch, cache: Cache) -> Tensor:
+        """Scores (B, V) of what follows each row.
+
+        Args:
+            batch: left-padded rows; their attention mask covers what the cache holds too, where any of it is padding.
+            cache: what was read before; takes in the rows.
+        """
+        inputs, _ = self._inputs(batch)
+        if bool(batch.attention_mask.all()):
+            inputs["attention_mask"] = None
+        out = self.core.model(**inputs, past_key_values=cache, use_cache=True)
+        return self.core.lm_head(out.last_hidden_state[:, -1]).float()
 
     @torch.no_grad()
     def generate(

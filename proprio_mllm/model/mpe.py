@@ -101,6 +101,7 @@ def position_ids(
     grids: Sequence[tuple[int, int]],
     centroids: Sequence[Centroid | None],
     mode: MpeMode,
+    start: int = 0,
 ) -> Tensor:
     """Ids (3, S) of one unpadded sequence.
 
@@ -110,12 +111,13 @@ def position_ids(
         grids: (h, w) of each image, in order.
         centroids: the robot's place in each image, or None.
         mode: one of `MPE_MODES`.
+        start: position of the first token.
 
     Raises:
         ValueError: when pads and grids do not match.
     """
     parts: list[Tensor] = []
-    index, start, image, size = 0, 0, 0, len(input_ids)
+    index, image, size = 0, 0, len(input_ids)
     while index < size:
         end = index
         if input_ids[index] == image_token:

@@ -1,17 +1,23 @@
 """From an observation to an example: the one place where a planner at run time and a demonstration in training meet.
 
-Both go through `plan_example`, so that the model sees the same text, image and robot state in training and in use.
+Both go through `plan_example`, or `turn_example` where whole episodes are read, so that the model sees the same text, image and
+robot state in training and in use.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from configs.schema.model import ModelConfig
 from data.interface.observation import Observation
 from proprio_mllm.model.batch import Example, View
+from proprio_mllm.model.chat import IMAGE, Encoded
+from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import plan_prompt, with_answer
+from proprio_mllm.model.vocabulary import motion_text
 
-__all__ = ["motion_codes", "plan_example", "view_of"]
+__all__ = ["motion_codes", "plan_example", "turn_example", "view_of"]
 
 
 def view_of(observation: Observation) -> View:
@@ -56,3 +62,38 @@ def plan_example(
         cfg.history,
     )
     return Example(messages if answer is None else with_answer(messages, answer), (view_of(observation),))
+
+
+def turn_example(
+    model: ProprioMLLM,
+    log: Sequence[int],
+    now: Sequence[int],
+    observation: Observation | None,
+    motion: MotionTokenizer | None = None,
+    answer: Sequence[int] = (),
+    read: int = 0,
+) -> Example:
+    """One decision of an episode (`proprio_mllm.model.wording`).
+
+    A picture and motion tokens stand before the word that opens the answer, so that the log, which is told in words alone, has
+    to be read once only.
+
+    Args:
+        model: gives the tokenizer, and says whether it sees and feels.
+        log: tokens of prefix and log.
+        now: tokens of the state, with the word that opens the answer.
+        observation: what is seen; None for models that do not see.
+        motion: the motion tokenizer.
+        answer: tokens of the answer, or its beginning; learnt in training.
+        read: tokens of the log to leave out because they have been read.
+    """
+    tokens, views = [*log, *now], ()
+    if model.cfg.sees:
+        assert observation is not None
+        codes = motion_codes(observation, model.cfg, motion)
+        text = IMAGE + (motion_text(codes) if codes is not None else "")
+        sight = model.processor.tokenizer(text, add_special_tokens=False)["input_ids"]
+        tokens, views = [*log, *now[:-1], *sight, now[-1]], (view_of(observation),)
+    learnt = [False] * len(tokens) + [True] * len(answer)
+    encoded = Encoded(tuple([*tokens, *answer][read:]), tuple(learnt[read:]))
+    return Example(views=views, tokens=encoded, start=read)

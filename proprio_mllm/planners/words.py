@@ -12,9 +12,9 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -27,8 +27,12 @@ from data.interface.observation import Observation
 from data.interface.sightings import Seen, Sightings
 from data.interface.steps import PlanStep
 from data.interface.symbolic import events_of
-from proprio_mllm.model.building import load_model
+from proprio_mllm.model.batch import Batch, Collator, Example
+from proprio_mllm.model.building import load_model, load_motion
+from proprio_mllm.model.chat import Encoded
 from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.model.observing import turn_example
 from proprio_mllm.model.word_tokens import WordTokens
 from proprio_mllm.model.wording import Words, log_words, prefix_words, read_step, state_words
 from proprio_mllm.planners.answers import AnswerGrammar
@@ -64,14 +68,14 @@ class WordsState:
     refused: dict[str, int] = field(default_factory=dict)
 
     def look(self, observation: Seen) -> list[int]:
-        """Takes in an observation; the tokens that stand before the answer."""
+        """Takes in an observation; the tokens of the state, which follow the log."""
         self.sightings.look(observation)
         if not self.log:
             self.log = self.words.tokens(prefix_words(observation))
         elif observation.history:
             self.log += self.words.tokens(log_words(observation.history[-1], self.sightings.new))
             self._count(observation)
-        return self.log + self.words.tokens(state_words(self.sightings))
+        return self.words.tokens(state_words(self.sightings))
 
     def _count(self, observation: Seen) -> None:
         before, last = [None, *observation.history][-2:]
@@ -88,17 +92,21 @@ class WordsPlanner:
     """A model in this process.
 
     Args:
-        model: trained by `stage=words`, in evaluation mode.
+        model: one that reads whole episodes, in evaluation mode.
+        motion: the motion tokenizer; needed when the model sees and its answers stand after motion tokens.
         temperature: 0 takes the most likely word.
         insist: whether steps may be taken that are bound to bring nothing (`AnswerGrammar`), or were refused twice.
     """
 
     privileged = False
-    image_size = 0
 
-    def __init__(self, model: ProprioMLLM, temperature: float = 0.0, insist: bool = False) -> None:
-        self.model, self.temperature, self.insist = model, temperature, insist
+    def __init__(
+        self, model: ProprioMLLM, motion: MotionTokenizer | None = None, temperature: float = 0.0, insist: bool = False
+    ) -> None:
+        self.model, self.motion, self.temperature, self.insist = model, motion, temperature, insist
+        self.image_size = model.cfg.image_size if model.cfg.sees else 0
         self._tokenizer = model.processor.tokenizer
+        self._collator = Collator(model.processor, model.cfg)
         self._state: WordsState | None = None
         self._pad = int(self._tokenizer.pad_token_id)
 
@@ -110,7 +118,8 @@ class WordsPlanner:
             WeightsError: when the folder has no model; the message names `train`, the command that makes it.
         """
         model = load_model(check_weights(folder, train))
-        return WordsPlanner(model.to("cuda") if torch.cuda.is_available() else model, temperature, insist)
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+        return WordsPlanner(model.to(device), load_motion(folder), temperature, insist)
 
     def begin(self, task: TaskInfo, rng: np.random.Generator) -> WordsState:
         """The state of a new episode."""
@@ -129,76 +138,44 @@ class WordsPlanner:
         """One reply per observation; the latency is the batch's, shared equally."""
         assert states is not None
         started = time.perf_counter()
-        prompts = [state.look(one) for one, state in zip(observations, states, strict=True)]
         answers = [self._answer(one, state) for one, state in zip(observations, states, strict=True)]
-        open_rows = list(range(len(answers)))
+        open_rows = answers
         for choice in range(_CHOICES):
-            self._write([prompts[row] for row in open_rows], [answers[row] for row in open_rows])
+            self._write(open_rows)
             if self.insist or choice == _CHOICES - 1:
                 break
-            open_rows = [row for row in open_rows if answers[row].refused() and answers[row].reconsider()]
+            open_rows = [answer for answer in open_rows if answer.refused() and answer.reconsider()]
             if not open_rows:
                 break
         each_s = (time.perf_counter() - started) / len(answers)
         replies: list[PlannerReply] = []
-        for prompt, answer in zip(prompts, answers, strict=True):
+        for answer in answers:
             step = answer.step()
-            replies.append(PlannerReply(step.to_text(), step, tokens=len(prompt) + len(answer.words), latency_s=each_s))
+            replies.append(PlannerReply(step.to_text(), step, tokens=answer.read + len(answer.words), latency_s=each_s))
         return replies
 
     def _answer(self, observation: Seen, state: WordsState) -> _Answer:
-        return _Answer(AnswerGrammar(observation.known_objects, None if self.insist else state.sightings.belief), state)
+        now = state.look(observation)
+        seen = observation if isinstance(observation, Observation) else None
+        turn = turn_example(self.model, state.log, now, seen, self.motion)
+        return _Answer(AnswerGrammar(observation.known_objects, None if self.insist else state.sightings.belief), state, turn)
 
-    @torch.no_grad()
-    def _write(self, prompts: Sequence[Sequence[int]], answers: Sequence[_Answer]) -> None:
-        """Continues every answer to its end."""
-        rows = [[*prompt, *answer.begun()] for prompt, answer in zip(prompts, answers, strict=True)]
-        if len(rows) == 1:
-            self._write_one(rows[0], answers[0])
-            return
-        size = max(map(len, rows))
-        ids = torch.full((len(rows), size), self._pad)
-        mask = torch.zeros(len(rows), size, dtype=torch.long)
-        for number, row in enumerate(rows):
-            ids[number, size - len(row) :] = torch.tensor(row)
-            mask[number, size - len(row) :] = 1
-        places = (mask.cumsum(1) - 1).clamp_min(0)
-        cache = DynamicCache()
+    def _write(self, answers: Sequence[_Answer]) -> None:
+        """Continues every answer to its end; what has been read of a log before is not read again for an answer alone."""
+        state = answers[0].state if len(answers) == 1 else None
+        cache = DynamicCache() if state is None else state.cache
+        batch = self._collator([answer.example(0 if state is None else state.cached) for answer in answers], padding="left")
         while True:
-            scores = self._scores(ids, places, cache, mask)
+            scores = self.model.following(batch.to(self.model.device), cache).cpu()
             tokens = [answer.choose(row, self.temperature) for answer, row in zip(answers, scores, strict=True)]
             if all(token is None for token in tokens):
-                return
-            ids = torch.tensor([[self._pad if token is None else token] for token in tokens])
-            places, mask = places[:, -1:] + 1, torch.cat([mask, mask.new_ones(len(rows), 1)], 1)
-
-    def _write_one(self, row: Sequence[int], answer: _Answer) -> None:
-        """One answer; what the log has been read of before is not read again."""
-        state, start = answer.state, answer.state.cached
-        ids = torch.tensor([row[start:]])
-        while True:
-            scores = self._scores(ids, torch.arange(start, start + ids.shape[1])[None], state.cache, None)
-            token = answer.choose(scores[0], self.temperature)
-            if token is None:
                 break
-            start += ids.shape[1]
-            ids = torch.tensor([[token]])
-        state.cached = len(state.log)
-        state.cache.crop(state.cached - state.cache.get_seq_length())  # minus what is no log
-
-    def _scores(self, ids: Tensor, places: Tensor, cache: DynamicCache, mask: Tensor | None) -> Tensor:
-        """Scores (B, V) of what follows tokens (B, L) at places (B, L)."""
-        text: Any = self.model.core.model.language_model
-        head: Any = self.model.core.lm_head
-        device = self.model.device
-        out = text(
-            input_ids=ids.to(device),
-            attention_mask=None if mask is None else mask.to(device),
-            position_ids=places.to(device),
-            past_key_values=cache,
-            use_cache=True,
-        )
-        return head(out.last_hidden_state[:, -1]).float().cpu()
+            ids = torch.tensor([[self._pad if token is None else token] for token in tokens])
+            mask = torch.cat([batch.attention_mask, torch.ones_like(ids)], 1)
+            batch = Batch(ids, mask, batch.position_ids[:, :, -1:] + 1, ids)
+        if state is not None:
+            state.cached = len(state.log)
+            state.cache.crop(state.cached - state.cache.get_seq_length())  # minus what is no log
 
 
 def plans_in_words(folder: str | Path) -> bool:
@@ -210,17 +187,28 @@ def plans_in_words(folder: str | Path) -> bool:
 class _Answer:
     """An answer under way: its words and tokens, and what else was likely at each of them."""
 
-    def __init__(self, grammar: AnswerGrammar, state: WordsState) -> None:
-        self._grammar, self.state = grammar, state
+    def __init__(self, grammar: AnswerGrammar, state: WordsState, turn: Example) -> None:
+        self._grammar, self.state, self._turn = grammar, state, turn
         self.words: list[str] = []
         self._tokens: list[list[int]] = []
         self._rest: list[int] = []
         self._margins: list[float] = []
         self._forbidden: dict[Words, set[str]] = {}
 
+    @property
+    def read(self) -> int:
+        """Tokens before it."""
+        return 0 if self._turn.tokens is None else len(self._turn.tokens.ids)
+
     def begun(self) -> list[int]:
         """Its tokens so far."""
         return [token for tokens in self._tokens for token in tokens]
+
+    def example(self, read: int) -> Example:
+        """What stands before it and its tokens so far, without the first tokens."""
+        assert self._turn.tokens is not None
+        ids = (*self._turn.tokens.ids, *self.begun())[read:]
+        return replace(self._turn, tokens=Encoded(ids, (False,) * len(ids)), start=read)
 
     def choose(self, scores: Tensor, temperature: float) -> int | None:
         """Takes the next word by the scores (V,) of tokens.

@@ -255,7 +255,7 @@ def test_collator_refuses_what_does_not_fit(cfg, processor, examples):
         collate([])
     with pytest.raises(ValueError, match="no views"):
         collate.images([])
-    with pytest.raises(ValueError, match="name 1 images, but it has 2 views"):
+    with pytest.raises(ValueError, match="names 1 images, but it has 2 views"):
         collate([dataclasses.replace(examples[0], views=examples[0].views * 2)])
     with pytest.raises(ValueError, match="left padding, got 'right'"):
         collate(examples, generation=True, padding="right")

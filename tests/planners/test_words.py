@@ -8,14 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from transformers import DynamicCache
 
 from configs.compose import compose
 from configs.schema.train import TrainConfig
 from configs.validate import build
-from data.interface.observation import HistoryItem
+from data.interface.observation import Camera, HistoryItem, Observation, Proprioception
 from data.interface.steps import PlanStep
 from proprio_mllm.evaluation.lessons import Lessons, Shown, WordsOnly
+from proprio_mllm.model.batch import Collator
 from proprio_mllm.model.building import build_model, build_processor, save_model
+from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.model.observing import turn_example
 from proprio_mllm.model.word_tokens import add_word_tokens
 from proprio_mllm.model.wording import answer_words
 from proprio_mllm.planners.answers import AnswerGrammar
@@ -26,16 +30,46 @@ from proprio_mllm.training.pipeline import base_model_config
 INFO = TaskInfo("", "h1", 20)
 
 
-@pytest.fixture(scope="module")
-def planner() -> WordsPlanner:
-    cfg = dataclasses.replace(base_model_config(build(TrainConfig, compose("train", ["stage=words"])).model), episodes=True)
-    small = dataclasses.replace(
-        cfg, text=dataclasses.replace(cfg.text, hidden=64, layers=2, heads=2, kv_heads=1, intermediate=96)
+def small(sees: bool = False) -> WordsPlanner:
+    whole = build(TrainConfig, compose("train", ["stage=words"])).model
+    cfg = whole if sees else base_model_config(whole)
+    text = dataclasses.replace(cfg.text, hidden=64, layers=2, heads=2, kv_heads=1, intermediate=96)
+    vision = dataclasses.replace(cfg.vision, hidden=32, depth=1, heads=2, intermediate=32)
+    motion_cfg = dataclasses.replace(cfg.motion, codes=32)
+    cfg = dataclasses.replace(
+        cfg,
+        episodes=True,
+        sees=sees,
+        text=text,
+        vision=vision,
+        motion=motion_cfg,
+        cse=dataclasses.replace(cfg.cse, enabled=False),
     )
     words = Lessons().words()
-    processor = build_processor(small, [" ".join(words)] * 2)
+    processor = build_processor(cfg, [" ".join(words)] * 2)
     add_word_tokens(processor.tokenizer, words)
-    return WordsPlanner(build_model(small, processor, 3).eval())
+    motion = MotionTokenizer(motion_cfg).eval() if sees else None
+    return WordsPlanner(build_model(cfg, processor, 3).eval(), motion)
+
+
+@pytest.fixture(scope="module")
+def planner() -> WordsPlanner:
+    return small()
+
+
+@pytest.fixture(scope="module")
+def seeing() -> WordsPlanner:
+    return small(sees=True)
+
+
+def seen(shown: Shown, seed: int) -> Observation:
+    """What is shown, with a picture and a body of a seed."""
+    rng = np.random.default_rng(seed)
+    body = Proprioception(rng.normal(size=(64, 48)).astype(np.float32), 20.0, np.zeros(3), rng.normal(size=(14, 3)))
+    image = rng.integers(0, 256, (112, 112, 3)).astype(np.uint8)
+    camera = Camera(np.array([[100.0, 0.0, 56.0], [0.0, 100.0, 56.0], [0.0, 0.0, 1.0]]), np.eye(4), 112, 112)
+    parts = (shown.visible_objects, shown.known_objects, body, shown.history, len(shown.history), 20)
+    return Observation(shown.instruction, shown.robot, image, camera, *parts)
 
 
 def begin(planner: WordsPlanner, seed: int = 0):
@@ -54,6 +88,59 @@ def test_side_by_side_as_alone(planner: WordsPlanner) -> None:
             if one.step.actions[0].name != "Done":
                 together[row].take(one.step)
                 alone[row].take(one.step)
+
+
+def test_side_by_side_as_alone_with_pictures(seeing: WordsPlanner) -> None:
+    together, alone = ([WordsOnly(seed) for seed in range(3)] for _ in range(2))
+    states, own = ([begin(seeing) for _ in range(3)] for _ in range(2))
+    for number in range(4):
+        replies = seeing.step_batch([seen(one.shown(), number) for one in together], states)
+        for row, reply in enumerate(replies):
+            one = seeing.step_batch([seen(alone[row].shown(), number)], [own[row]])[0]
+            assert one.text == reply.text
+            assert own[row].cached == len(own[row].log) == own[row].cache.get_seq_length()  # no picture stays in the log
+            assert one.step is not None
+            together[row].take(one.step)
+            alone[row].take(one.step)
+
+
+@pytest.mark.parametrize("changed", ["image", "motion"])
+def test_what_is_seen_and_felt_tells_in_the_answer(seeing: WordsPlanner, changed: str) -> None:
+    shown = WordsOnly(3).shown()
+    one, other = seen(shown, 0), seen(shown, 1)
+    mixed = (
+        dataclasses.replace(one, image=other.image)
+        if changed == "image"
+        else dataclasses.replace(
+            one, proprioception=dataclasses.replace(one.proprioception, motion=other.proprioception.motion)
+        )
+    )
+
+    def scores(observation: Observation) -> torch.Tensor:
+        state = begin(seeing)
+        turn = turn_example(seeing.model, (), state.look(observation), observation, seeing.motion)
+        return seeing.model.following(Collator(seeing.model.processor, seeing.model.cfg)([turn]), DynamicCache())
+
+    assert torch.equal(scores(one), scores(one))
+    assert not torch.allclose(scores(one), scores(mixed), atol=1e-6)
+
+
+def test_a_picture_stands_before_the_word_that_opens_the_answer(seeing: WordsPlanner) -> None:
+    state, observation = begin(seeing), seen(WordsOnly(3).shown(), 0)
+    now = state.look(observation)
+    example = turn_example(seeing.model, state.log, now, observation, seeing.motion, answer=[7, 8])
+    assert example.tokens is not None
+    ids, told = list(example.tokens.ids), [*state.log, *now]
+    assert ids[: len(told) - 1] == told[:-1]
+    assert ids[-3:] == [told[-1], 7, 8]
+    assert example.tokens.targets == (False,) * (len(ids) - 2) + (True, True)
+    read = turn_example(seeing.model, state.log, now, observation, seeing.motion, read=5)
+    assert read.tokens is not None
+    collate = Collator(seeing.model.processor, seeing.model.cfg)
+    whole, rest = collate([example]), collate([read])
+    assert torch.equal(whole.position_ids[:, :, 5:-2], rest.position_ids)
+    assert whole.labels[0, -2:].tolist() == [7, 8]
+    assert whole.supervised == 2
 
 
 def test_what_has_been_read_is_not_read_again(planner: WordsPlanner) -> None:
@@ -99,13 +186,12 @@ def test_names_that_end_like_plurals_are_written_as_they_are_read(planner: Words
             assert {one.object_id for one in reply.step.actions} <= {None, "Zubos_1", "Kafus_1"}
             assert alone.words.tokens(["zubos"]) == [alone.words.tokens(["zubo"])[0], alone.words.known["s"]]
     state, known = begin(planner), planner.model.processor.tokenizer
-    answer = _Answer(AnswerGrammar(shown.known_objects), state)
-    prompt, wanted = state.look(shown), answer_words("GoTo", "Zubos_1", PlanStep.parse("GoTo(Zubos_1)"))
+    now, wanted = state.look(shown), answer_words("GoTo", "Zubos_1", PlanStep.parse("GoTo(Zubos_1)"))
+    answer = _Answer(AnswerGrammar(shown.known_objects), state, turn_example(planner.model, state.log, now, None))
     written: list[int] = []
     expected = state.words.tokens(wanted)
     while (token := answer.choose(torch.eye(len(known))[expected[min(len(written), len(expected) - 1)]], 0.0)) is not None:
         written.append(token)
-    assert prompt
     assert written == expected == answer.begun()
     assert answer.step() == PlanStep.parse("GoTo(Zubos_1)")
 
