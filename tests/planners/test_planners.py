@@ -81,6 +81,7 @@ def test_every_configured_planner_is_made_somewhere() -> None:
     kinds = set()
     for path in sorted((CONFIG_DIR / "planner").glob("*.yaml")):
         needs = ["backend.model=folder", "workers=0"] if path.stem in ("qwen2_5_vl", "internvl2_5") else []
+        needs += ["planner.source=own.py:Own"] if path.stem == "file" else []
         cfg = build(EvalConfig, compose("eval", [f"planner={path.stem}", *needs]))
         assert cfg.planner.name == path.stem
         assert (cfg.backend is not None) == (cfg.planner.kind in CHAT_PLANNERS)
