@@ -16,6 +16,7 @@ from configs.validate import build
 @pytest.mark.parametrize("robot", ["h1", "x1"])
 def test_every_planner_composes(planner: str, robot: str) -> None:
     needs = ["backend.model=folder", "workers=0"] if planner in ("qwen2_5_vl", "internvl2_5") else []
+    needs += ["planner.source=own.py:Own"] if planner == "file" else []
     cfg = build(EvalConfig, compose("eval", [f"planner={planner}", f"robot={robot}", "difficulty=hard", "trials=3", *needs]))
     assert (cfg.planner.name, cfg.robot.name, cfg.difficulty, cfg.trials) == (planner, robot, "hard", 3)
     assert cfg.experiment is None
