@@ -261,7 +261,7 @@ class _Believed:
         state, name = self._state, object_id
         return _Thing(
             object_id=name,
-            holders=tuple(arm.value for arm in Arm if name in (state.held[arm], state.lifted)),
+            holders=state.holders(name),
             movable=name not in state.self_closing,
             two_handed=name in self._belief.heavy,
             liftable=name not in self._belief.light,

@@ -82,7 +82,11 @@ class SymbolicState:
 
     def holds(self, object_id: str) -> bool:
         """Whether an object is held up, by one hand or both; what is steadied where it rests is not."""
-        return object_id in (self.lifted, *self.held.values()) and object_id not in self.in_place
+        return bool(self.holders(object_id)) and object_id not in self.in_place
+
+    def holders(self, object_id: str) -> tuple[str, ...]:
+        """The arms that hold an object, at furniture its door."""
+        return tuple(arm.value for arm in Arm if object_id in (self.held[arm], self.lifted))
 
     def is_in(self, condition: Condition, object_id: str) -> bool | None:
         """Whether an object is in a state, None when that is not known."""

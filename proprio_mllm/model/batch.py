@@ -125,6 +125,12 @@ class Batch(Movable):
     labels: Tensor
     images: ImageBatch | None = None
 
+    def then(self, tokens: Tensor) -> Batch:
+        """One more token (B,) after each left-padded row, where a cache holds the rows."""
+        ids = tokens[:, None]
+        mask = torch.cat([self.attention_mask, self.attention_mask.new_ones(ids.shape)], dim=1)
+        return Batch(ids, mask, self.position_ids[:, :, -1:] + 1, ids)  # text follows text
+
     @property
     def supervised(self) -> int:
         """Number of supervised tokens; the first position of a row predicts nothing and is not counted."""

@@ -17,7 +17,7 @@ import torch
 from peft import PeftModel
 from torch import Tensor, nn
 from torch.nn import functional
-from transformers import Cache, Qwen2_5_VLForConditionalGeneration
+from transformers import Cache, DynamicCache, Qwen2_5_VLForConditionalGeneration
 from transformers.modeling_outputs import BaseModelOutputWithPooling
 
 from configs.schema.model import ModelConfig
@@ -219,13 +219,11 @@ class ProprioMLLM(nn.Module):
             raise ValueError(f"temperature {temperature} must not be negative")
         if int(batch.attention_mask[:, -1].min()) == 0:
             raise ValueError("generation needs left padding: the last position of a row is padding")
-        inputs, _ = self._inputs(batch)
-        mask, place = batch.attention_mask, batch.position_ids[:, :, -1:]
-        out = self.core.model(**inputs, use_cache=True)
-        replies: list[list[int]] = [[] for _ in range(len(mask))]
-        done = torch.zeros(len(mask), dtype=torch.bool, device=mask.device)
+        cache = DynamicCache()
+        replies: list[list[int]] = [[] for _ in range(len(batch.input_ids))]
+        done = torch.zeros(len(replies), dtype=torch.bool, device=batch.input_ids.device)
         for _ in range(max_new_tokens):
-            logits = self.core.lm_head(out.last_hidden_state[:, -1]).float()  # (B, V)
+            logits = self.following(batch, cache)
             logits[:, self._never] = float("-inf")
             token = self._choose(logits, temperature, generator)  # (B,)
             done |= token == self._end
@@ -234,15 +232,7 @@ class ProprioMLLM(nn.Module):
             for row, (value, over) in enumerate(zip(token.tolist(), done.tolist(), strict=True)):
                 if not over:
                     replies[row].append(value)
-            place = place + 1  # text follows text
-            mask = torch.cat([mask, mask.new_ones(len(mask), 1)], dim=1)
-            out = self.core.model(
-                input_ids=token.masked_fill(done, self._pad)[:, None],
-                attention_mask=mask,
-                position_ids=place,
-                past_key_values=out.past_key_values,
-                use_cache=True,
-            )
+            batch = batch.then(token.masked_fill(done, self._pad))
         return replies
 
     @staticmethod

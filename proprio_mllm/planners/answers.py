@@ -6,7 +6,7 @@ Paper: none; its planners are free to answer anything. Constrained, every reply 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Final
 
 from data.interface.actions import ACTIONS, ActionKind, ActionSpec, Amount, exclude_each_other
@@ -39,7 +39,6 @@ class AnswerGrammar:
         self._belief = belief
         places = [name for name in ids if type_of(name) in (*SURFACES, *SEATS, *CONTAINERS)]
         self._searched = frozenset() if belief is None else _searched(places, belief)
-        self._searching = False
 
     def allowed(self, words: Sequence[str]) -> list[str]:
         """The words that may follow some words of an answer; none after its end."""
@@ -51,25 +50,25 @@ class AnswerGrammar:
                 return ["do"]
             following = _next(words[1:], (one for one, name in self.ids.items() if self._may_be_wanted(spec, name)))
             return [*following, "unseen"] if len(words) == 1 else following or ["do"]
-        self._searching = words[1] == "unseen"
+        skipped = self._searched if words[1] == "unseen" else frozenset()
         step = list(words[words.index("do") + 1 :])  # type: ignore[attr-defined]  # every sequence has index
         if step and step[-1] == END:
             return []
         if "&" in step:
             cut = step.index("&")
-            return self._of_action(step[cut + 1 :], self._action(step[:cut]))
-        return self._of_action(step, None)
+            return self._of_action(step[cut + 1 :], self._action(step[:cut]), skipped)
+        return self._of_action(step, None, skipped)
 
-    def _of_action(self, words: Sequence[str], first: Action | None) -> list[str]:
+    def _of_action(self, words: Sequence[str], first: Action | None, skipped: Collection[str]) -> list[str]:
         if not words:
-            return [name for name, spec in ACTIONS.items() if any(True for _ in self._arms(spec, first))]
+            return [name for name, spec in ACTIONS.items() if any(True for _ in self._arms(spec, first, skipped))]
         spec, rest, arm = ACTIONS[words[0]], list(words[1:]), None
         if spec.kind is ActionKind.ARM:
             if not rest:
-                return [one.value for one in self._arms(spec, first) if one is not None]
+                return [one.value for one in self._arms(spec, first, skipped) if one is not None]
             arm = Arm(rest.pop(0))
         if spec.takes_object:
-            if following := _next(rest, self._targets(spec, arm, first)):
+            if following := _next(rest, self._targets(spec, arm, first, skipped)):
                 return following
             rest = rest[next(index for index, word in enumerate(rest) if word.startswith("_")) + 1 :]
         more = _numbers(spec.amounts[len(rest)]) if len(rest) < len(spec.amounts) else ()
@@ -82,22 +81,31 @@ class AnswerGrammar:
             after.append("&")
         return after
 
-    def _arms(self, spec: ActionSpec, first: Action | None) -> Iterator[Arm | None]:
+    def _arms(self, spec: ActionSpec, first: Action | None, skipped: Collection[str]) -> Iterator[Arm | None]:
         """The arms that may do an action beside a first one; None for what is not an arm's, if it may be done."""
         if first is not None and spec.kind is not ActionKind.ARM:
             return
         arms = (None,) if spec.kind is not ActionKind.ARM else tuple(Arm) if first is None else (_other(first),)
-        yield from (arm for arm in arms if any(True for _ in self._targets(spec, arm, first)))
+        yield from (arm for arm in arms if any(True for _ in self._targets(spec, arm, first, skipped)))
 
-    def _targets(self, spec: ActionSpec, arm: Arm | None, first: Action | None) -> Iterator[tuple[str, ...]]:
-        """The words of what an action may be about; no words for an action that is about nothing."""
+    def _targets(
+        self, spec: ActionSpec, arm: Arm | None, first: Action | None, skipped: Collection[str]
+    ) -> Iterator[tuple[str, ...]]:
+        """The words of what an action may be about; no words for an action that is about nothing.
+
+        Args:
+            spec: the action.
+            arm: its arm.
+            first: the action beside it.
+            skipped: what is not walked to.
+        """
         for words, name in self.ids.items() if spec.takes_object else (((), None),):
             action = Action(spec.name, arm, name)
             if name is not None and not self._may_be_wanted(spec, name):
                 continue
             if first is not None and exclude_each_other(first, action):
                 continue
-            if self._searching and name in self._searched and spec.has_effect(Walk):
+            if name in skipped and spec.has_effect(Walk):
                 continue
             if self._belief is None or (self._belief.refusal(action) is None and self._may_come_now(spec)):
                 yield words

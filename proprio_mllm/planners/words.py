@@ -27,7 +27,7 @@ from data.interface.observation import Observation
 from data.interface.sightings import Seen, Sightings
 from data.interface.steps import PlanStep
 from data.interface.symbolic import events_of
-from proprio_mllm.model.batch import Batch, Collator, Example
+from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import load_model, load_motion
 from proprio_mllm.model.chat import Encoded
 from proprio_mllm.model.modeling import ProprioMLLM
@@ -170,9 +170,7 @@ class WordsPlanner:
             tokens = [answer.choose(row, self.temperature) for answer, row in zip(answers, scores, strict=True)]
             if all(token is None for token in tokens):
                 break
-            ids = torch.tensor([[self._pad if token is None else token] for token in tokens])
-            mask = torch.cat([batch.attention_mask, torch.ones_like(ids)], 1)
-            batch = Batch(ids, mask, batch.position_ids[:, :, -1:] + 1, ids)
+            batch = batch.then(torch.tensor([self._pad if token is None else token for token in tokens]))
         if state is not None:
             state.cached = len(state.log)
             state.cache.crop(state.cached - state.cache.get_seq_length())  # minus what is no log

@@ -55,7 +55,7 @@ class TextObject:
     @property
     def holders(self) -> Collection[str]:
         """The arms that hold it."""
-        return self._facts.holders(self.object_id)
+        return self._facts.state.holders(self.object_id)
 
     @property
     def opened(self) -> bool:
@@ -176,12 +176,6 @@ class TextFacts:
         return name if any("spout" in part.options for part in self.objects[name].kind.parts) else None
 
     # ---- what else is asked
-
-    def holders(self, object_id: str) -> tuple[str, ...]:
-        """The arms that hold an object."""
-        if self.state.lifted == object_id:
-            return tuple(arm.value for arm in Arm)
-        return tuple(arm.value for arm, item in self.state.held.items() if item == object_id)
 
     def hidden(self, object_id: str) -> bool:
         """Whether an object is shut away."""
