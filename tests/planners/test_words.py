@@ -16,7 +16,7 @@ from configs.validate import build
 from data.interface.observation import Camera, HistoryItem, Observation, Proprioception
 from data.interface.steps import PlanStep
 from proprio_mllm.evaluation.lessons import Lessons, Shown, WordsOnly
-from proprio_mllm.model.batch import Collator
+from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import build_model, build_processor, save_model
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.observing import turn_example
@@ -141,6 +141,26 @@ def test_a_picture_stands_before_the_word_that_opens_the_answer(seeing: WordsPla
     assert torch.equal(whole.position_ids[:, :, 5:-2], rest.position_ids)
     assert whole.labels[0, -2:].tolist() == [7, 8]
     assert whole.supervised == 2
+
+
+def test_token_after_token_is_read_as_all_at_once(seeing: WordsPlanner) -> None:
+    model, collate = seeing.model, Collator(seeing.model.processor, seeing.model.cfg)
+    turns = [(begin(seeing), seen(WordsOnly(seed).shown(), seed)) for seed in (3, 4)]  # of different lengths: one is padded
+    nows = [state.look(observation) for state, observation in turns]
+    words = [[500, 510, 520], [530, 540, 550]]
+
+    def examples(count: int) -> list[Example]:
+        return [
+            turn_example(model, state.log, now, observation, seeing.motion, answer=answer[:count])
+            for (state, observation), now, answer in zip(turns, nows, words, strict=True)
+        ]
+
+    cache, batch = DynamicCache(), collate(examples(0), padding="left")
+    for count in range(4):
+        whole = model.following(collate(examples(count), padding="left"), DynamicCache())
+        torch.testing.assert_close(model.following(batch, cache), whole, atol=1e-5, rtol=1e-4)
+        if count < 3:
+            batch = batch.then(torch.tensor([answer[count] for answer in words]))
 
 
 def test_what_has_been_read_is_not_read_again(planner: WordsPlanner) -> None:
