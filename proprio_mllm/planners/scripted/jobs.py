@@ -236,7 +236,10 @@ def _fill(want: Want, belief: Belief, known: Sequence[str]) -> list[Job]:
 
 
 def _carry(light: Sequence[Want], belief: Belief) -> list[Job]:
-    """Carrying small things: the hands are filled first, but one stays free for a door that is still shut."""
+    """Carrying small things: the hands are filled first, but one stays free for a door that is still shut.
+
+    What is where it belongs already is put down before more is taken.
+    """
     in_hand = [want for want in light if belief.state.arm_with(want.obj) is not None]
     waiting = [want for want in light if want not in in_hand]
     if in_hand:  # what may be anywhere is not searched with full hands
@@ -249,7 +252,9 @@ def _carry(light: Sequence[Want], belief: Belief) -> list[Job]:
         if ajar and not in_hand and len(waiting) > 1:
             return [Job("Open", ajar[0])]
         room = 1 if shut else len(free)
-        return list(dict.fromkeys(_pick(w.obj, w.spoken_obj, w.source, belief) for w in waiting))[:room]
+        here = [want for want in in_hand if want.place == belief.state.here is not None]
+        arrived = [Job("Place", want.place, belief.state.arm_with(want.obj)) for want in here]
+        return arrived + list(dict.fromkeys(_pick(w.obj, w.spoken_obj, w.source, belief) for w in waiting))[:room]
     jobs = []
     for want in in_hand:
         if _is_shut(want.place, belief) and free:

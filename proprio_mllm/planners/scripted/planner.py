@@ -18,6 +18,7 @@ import numpy as np
 from data.interface.actions import ACTIONS, ActionKind
 from data.interface.belief import ARM_SPECIFIC, Belief
 from data.interface.bodies import Arm
+from data.interface.effects import Grasp
 from data.interface.failures import FailureCode
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
@@ -58,6 +59,8 @@ _KNOWLEDGE: Final = (
     FailureCode.ALREADY_HELD,
     FailureCode.IN_USE,
 )
+#: Codes that another height of the pelvis may answer.
+_HEIGHT: Final = (FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW)
 _WITH_OBJECT: Final = ("Pick", "ToggleOn", "ToggleOff", "Open", "Place")
 
 
@@ -115,6 +118,9 @@ class ScriptedPlanner:
             return PlanStep((self._memory.search(head.spoken),))
         if head.target == "":
             return PlanStep((head.action(head.arm),))
+        steadied = belief.state.arm_with(head.target) if head.target in belief.state.in_place else None
+        if steadied is not None and ACTIONS[head.verb].has_effect(Grasp):
+            return PlanStep((Action("Release", arm=steadied),))
         moved = self._approach(head, belief)
         if moved is not None:
             return PlanStep((moved,))
@@ -173,7 +179,7 @@ class ScriptedPlanner:
         last = next((event for event in belief.last if event.about(job.verb, target) and not event.ok), None)
         if last is None:
             return self._walk(job, belief, failed=bool(failed))
-        if last.code in (FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW):
+        if last.code in _HEIGHT:
             return self._height(job, belief, up=last.code == FailureCode.BODY_TOO_LOW)
         if last.code in _BAD_LUCK and len(failed) % 3:
             return None
@@ -238,7 +244,7 @@ class ScriptedPlanner:
             if job.target == head.target and not head.verb == job.verb == "Place":
                 continue
             in_view = job.target in seen.visible_objects or self._memory.is_near(job.target or "", job.place)
-            if in_view and not belief.failures(job.verb, job.target):
+            if in_view and all(event.code in _HEIGHT for event in belief.failures(job.verb, job.target)):
                 return PlanStep((first, job.action(arm.other)))
         return PlanStep((first,))
 

@@ -221,6 +221,30 @@ def test_both_arms_at_once() -> None:
     assert answer("Put the mug and the cup on the counter.", put, ["Mug_1", "Cup_1"]) == both
 
 
+def test_both_arms_try_again_when_the_height_was_wrong() -> None:
+    lines = ["GoTo(Mug_1) ok", "Pick(right, Mug_1) ok", "Pick(left, Cup_1) ok", "GoTo(SideTable_1) ok"]
+    missed = "Place(right, SideTable_1) BodyTooHigh; Place(left, SideTable_1) BodyTooHigh"
+    text, seen = "put the mug and the cup on the side table", ("Mug_1", "Cup_1")
+    both = answer(text, lines, seen)
+    assert both == "Place(right, SideTable_1) & Place(left, SideTable_1)"
+    assert answer(text, [*lines, missed], seen) == "MoveDown(0.1)"
+    assert answer(text, [*lines, missed, "MoveDown(0.1) ok"], seen) == both
+
+
+def test_what_is_where_it_belongs_is_put_down_before_more_is_taken() -> None:
+    text, seen = "put the mug and the cup on the side table, and the book on the counter", ("Mug_1", "Cup_1", "Book_1")
+    lines = ["GoTo(Mug_1) ok", "Pick(right, Mug_1) ok", "Pick(left, Cup_1) ok", "GoTo(SideTable_1) ok"]
+    half = "Place(right, SideTable_1) ok; Place(left, SideTable_1) BodyTooHigh"
+    assert answer(text, [*lines, half], seen) == "MoveDown(0.1)"
+    assert answer(text, [*lines, half, "MoveDown(0.1) ok"], seen).startswith("Place(left, SideTable_1)")
+
+
+def test_what_is_steadied_is_let_go_of_before_it_is_taken() -> None:
+    lines = ["GoTo(Mug_1) ok", "Hold(left, Mug_1) ok"]
+    assert answer("pick up the mug", lines, ["Mug_1"]) == "Release(left)"
+    assert answer("pick up the mug", [*lines, "Release(left) ok"], ["Mug_1"]).startswith("Pick(")
+
+
 def test_what_is_in_hand_is_put_down_before_a_search() -> None:
     lines = ["GoTo(Mug_1) ok", "Pick(right, Mug_1) ok", "GoTo(CounterTop_1) ok"]
     assert answer("Put two mugs on the counter.", lines, ["Mug_1"]) == "Place(right, CounterTop_1)"
