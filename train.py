@@ -1,8 +1,8 @@
 """Trains Proprio-MLLM: `python train.py stage=all model=tiny` (paper, three stages; `stage=base` stands in for pretraining).
 
-Stages: data (motions to clips shards), collect (views, planning in words, demonstrations), base, dagger (the base model acts,
-the expert corrects it), pointmap, tokenizer, alignment, selu; `all` runs them in order and skips what is current. `words`
-(whole episodes in words) is run by its name: no other stage starts from it. Options are documented in configs/schema/train.py.
+Stages: data (motions to clips shards), collect (views, planning in words, demonstrations, lessons), base, dagger (the base
+model acts, the expert corrects it), pointmap, tokenizer, alignment, selu; `all` runs them in order and skips what is current.
+`words` (whole episodes in words) is run by its name: no other stage starts from it. Options: configs/schema/train.py.
 """
 
 from __future__ import annotations
@@ -36,25 +36,27 @@ def make_data(cfg: TrainConfig) -> None:
 
 
 def make_shards(cfg: TrainConfig) -> None:
-    """Posed views, exercises in words, and the expert's demonstrations on training tasks."""
+    """Posed views, exercises in words, the expert's demonstrations and the rules' lessons on training tasks."""
     from configs.schema.collect import CollectConfig as ShardConfig
+    from proprio_mllm.evaluation.dagger import collect_lessons
     from proprio_mllm.training.paths import StagePaths
     from sim.collection.collect import collect
 
-    wanted: tuple[tuple[Literal["views", "text_planning", "goal_questions", "demos"], int, int], ...]
-    wanted = (
-        ("views", cfg.collect.views, 240),
-        ("text_planning", cfg.collect.text_planning, 1000),
-        ("goal_questions", cfg.collect.text_planning, 1000),
-        ("demos", cfg.collect.episodes, 10),
+    kinds: tuple[tuple[str, Literal["views", "text_planning", "goal_questions", "demos"], int, int], ...]
+    kinds = (
+        ("views", "views", cfg.collect.views, 240),
+        ("text_planning", "text_planning", cfg.collect.text_planning, 1000),
+        ("goal_questions", "goal_questions", cfg.collect.text_planning, 1000),
+        ("demos", "demos", cfg.collect.episodes, 10),
+        ("lessons", "demos", cfg.collect.lessons, 10),
     )
-    for kind, count, part in wanted:
-        out = StagePaths(cfg).shards(kind)
+    for name, kind, count, part in kinds:
         shards = ShardConfig(
-            kind=kind, out=str(out), count=count, seed=cfg.seed, image_size=cfg.model.image_size, part_size=part,
-            workers=cfg.collect.workers, robots=cfg.data.robots,
+            kind=kind, out=str(StagePaths(cfg).shards(name)), count=count, seed=cfg.seed, image_size=cfg.model.image_size,
+            part_size=part, workers=cfg.collect.workers, robots=cfg.data.robots,
         )  # fmt: skip
-        collect(shards, overwrite=cfg.overwrite, progress=_progress(kind))
+        write = collect_lessons if name == "lessons" else collect
+        write(shards, overwrite=cfg.overwrite, progress=_progress(name))
 
 
 def _progress(name: str) -> Callable[[int, int], None]:
@@ -82,6 +84,7 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
     import torch
 
     from proprio_mllm.evaluation.lessons import Lessons
+    from proprio_mllm.training.paths import StagePaths
     from proprio_mllm.training.pipeline import Pipeline, StageError
     from proprio_mllm.training.stages import STAGES
 
@@ -90,8 +93,9 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
     command = " ".join(["python train.py", *sys.argv[1:]])
     robots = cfg.data.robots
     pipeline = Pipeline(
-        STAGES, cfg, partial(_rollouts, robots=robots), command, partial(_dagger, robots=robots), Lessons(robots)
-    )
+        STAGES, cfg, partial(_rollouts, robots=robots), command, partial(_dagger, robots=robots),
+        Lessons(robots, StagePaths(cfg).shards("lessons")),
+    )  # fmt: skip
     wanted = tuple(name for name in STAGES if name != "words") if cfg.stage == "all" else (cfg.stage,)
     metrics = {name: pipeline.run(name) for name in wanted}
     if cfg.release is not None:

@@ -109,13 +109,15 @@ class WordsConfig:
     Attributes:
         loop: an example is an episode.
         reading: weight of predicting what is read, the log and the blocks before answers, beside the answers.
+        logged: share of episodes from the simulator; the others are of the text world.
     """
 
     loop: LoopConfig
     reading: float = 1.0
+    logged: float = 0.2
 
     def __post_init__(self) -> None:
-        _require_shares(self, "reading")
+        _require_shares(self, "reading", "logged")
 
 
 @dataclass(frozen=True)
@@ -187,12 +189,14 @@ class CollectStageConfig:
         views: posed views.
         text_planning: episodes in words alone, for planning and for judging.
         episodes: expert episodes.
+        lessons: episodes of the rules, with mistakes among their steps.
         workers: processes.
     """
 
     views: int = 6000
     text_planning: int = 2000
     episodes: int = 500
+    lessons: int = 500
     workers: int = 2
 
 

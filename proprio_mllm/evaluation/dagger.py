@@ -6,6 +6,9 @@ the demonstrations of stages 2 and 3, and those in words alone (`sim.collection.
 exercises. This is the bridge that `train.py` wires: training asks with a `DaggerRequest` and reads `demos` or `text_planning`
 shards.
 
+Lessons are the same with the teacher of `proprio_mllm.evaluation.lessons` in place of the expert and, without a student, its
+own steps with mistakes among them.
+
 Part files are a function of the request and their number, so a run can be killed and continued. The paper has no such data; its
 pretrained backbone reads feedback in plain words already.
 """
@@ -13,6 +16,7 @@ pretrained backbone reads feedback in plain words already.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,20 +24,23 @@ from concurrent.futures import as_completed
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
 from tqdm import tqdm
 
 from configs.schema.collect import CollectConfig
-from data.interface.bodies import PAPER_ROBOTS
+from data.interface.actions import ACTIONS, ActionKind
+from data.interface.bodies import PAPER_ROBOTS, Arm
 from data.interface.observation import Observation
-from data.interface.steps import PlanStep
-from data.shards import ShardWriter
+from data.interface.steps import Action, PlanStep
+from data.shards import Manifest, ShardWriter, config_hash
 from data.workers import worker_pool
+from proprio_mllm.planners.protocol import TaskInfo
 from proprio_mllm.training.rollouts import DaggerRequest
 
 if TYPE_CHECKING:
     from proprio_mllm.planners.mllm import MllmPlanner
 
-__all__ = ["collect_dagger", "student_in_text"]
+__all__ = ["collect_dagger", "collect_lessons", "student_in_text"]
 
 #: Episodes of a part; those in words go side by side.
 _PER_PART: Final[dict[str, int]] = {"demos": 10, "text_planning": 50}
@@ -56,24 +63,95 @@ def collect_dagger(request: DaggerRequest, robots: Sequence[str] = PAPER_ROBOTS,
     count = -(-request.episodes // size)
     missing = writer.missing(count)
     with tqdm(total=count, initial=count - len(missing), desc=f"dagger ({request.kind})", unit="part") as bar:
-        for part, rows in _computed(config, missing, str(request.model), workers):
+        for part, rows in _computed(functools.partial(_part, config, model=str(request.model)), missing, workers):
             writer.write(part, rows)
             bar.update(1)
     writer.finish({"student": str(request.model), "expert_share": request.expert_share})
 
 
+def collect_lessons(
+    config: CollectConfig,
+    progress: Callable[[int, int], None] | None = None,
+    overwrite: bool = False,
+    student: Path | None = None,
+) -> Manifest:
+    """Writes a complete folder of lessons in the simulator, as `demos` shards; an interrupted one is continued part by part.
+
+    Args:
+        config: how many, of whom, and where they go.
+        progress: called with (parts done, parts in all).
+        overwrite: start over when the folder holds something else.
+        student: folder of a words model that acts in them; None for the teacher with mistakes.
+    """
+    keyed = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "workers")}
+    writer = ShardWriter(Path(config.out), config.kind, config_hash({**keyed, "version": 1}), overwrite)
+    total = -(-config.count // config.part_size)
+    missing = writer.missing(total)
+    report = progress or (lambda done, parts: None)
+    report(total - len(missing), total)
+    job = functools.partial(_lessons, config, student=None if student is None else str(student))
+    for count, (part, rows) in enumerate(_computed(job, missing, config.workers), total - len(missing) + 1):
+        writer.write(part, rows)
+        report(count, total)
+    return writer.finish({"config": keyed, "student": None if student is None else str(student)})
+
+
+def _lessons(config: CollectConfig, part: int, student: str | None) -> list[dict[str, Any]]:
+    """One part of a folder of lessons."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from sim.collection.demonstrations import lessons_of_part
+
+    return list(lessons_of_part(config, part, _rules(), None if student is None else _in_words(student)))
+
+
+def _rules() -> Callable[[Observation], tuple[PlanStep, Action | None] | None]:
+    """The scripted planner as a teacher of `sim.collection.demonstrations`."""
+    from proprio_mllm.planners.scripted.planner import ScriptedPlanner
+
+    planner = ScriptedPlanner()
+
+    def answer(observation: Observation) -> tuple[PlanStep, Action | None] | None:
+        if not observation.history:
+            planner.reset(_task(observation), np.random.default_rng(0))
+        step, job = planner.decide(observation)
+        if job is None:
+            return None
+        arm = job.arm or (Arm.RIGHT if ACTIONS[job.verb].kind is ActionKind.ARM else None)
+        return step, job.action(arm) if job.target else None
+
+    return answer
+
+
+def _in_words(model: str) -> Callable[[Observation], PlanStep | None]:
+    """A words model as a student of `sim.collection.demonstrations`."""
+    from proprio_mllm.planners.words import WordsPlanner
+
+    planner = WordsPlanner.load(Path(model))
+
+    def step(observation: Observation) -> PlanStep | None:
+        if not observation.history:
+            planner.reset(_task(observation), np.random.default_rng(0))
+        return planner.step(observation, None).step
+
+    return step
+
+
+def _task(observation: Observation) -> TaskInfo:
+    return TaskInfo(observation.instruction, observation.robot, observation.time_limit)
+
+
 def _computed(
-    config: CollectConfig, missing: Sequence[int], model: str, workers: int
+    job: Callable[[int], list[dict[str, Any]]], missing: Sequence[int], workers: int
 ) -> Iterator[tuple[int, list[dict[str, Any]]]]:
     """Parts as they are finished."""
     if workers == 1 or len(missing) < 2:
         for part in missing:
             with _one_thread():
-                rows = _part(config, part, model)
+                rows = job(part)
             yield part, rows
         return
     with worker_pool(min(workers, len(missing))) as pool:
-        futures = {pool.submit(_part, config, part, model): part for part in missing}
+        futures = {pool.submit(job, part): part for part in missing}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()
 

@@ -2,7 +2,8 @@
 
 The teacher is the scripted planner: what it answers is a function of what it is shown, in the text world as in the simulator,
 so a model that sees the same can learn it. Part of the steps that are taken are mistakes; the teacher's answer to what follows
-from them is what is learnt. In half of the episodes some object types bear made-up names, in the instruction and in their ids,
+from them is what is learnt. Episodes are made in the text world, or read from logs of the simulator, which are told in the same
+words. In half of the episodes some object types bear made-up names, in the instruction and in their ids,
 so that things are named by reading and not by heart.
 
 This is the bridge that `train.py` wires: training asks for the episode of a seed and knows neither worlds nor planners.
@@ -12,8 +13,9 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -24,6 +26,7 @@ from data.interface.failures import FAILURES
 from data.interface.observation import HistoryItem
 from data.interface.sightings import Sightings
 from data.interface.steps import Action, PlanStep
+from data.shards import ShardReader
 from proprio_mllm.model.wording import (
     ID_NUMBERS,
     MARKERS,
@@ -38,6 +41,7 @@ from proprio_mllm.model.wording import (
     text_words,
 )
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
+from proprio_mllm.training.sources import held_out
 from sim.collection.text_planning import draw_task
 from sim.collection.text_world import TextWorld, feedback_text
 from sim.robots.spec import load_robot
@@ -114,10 +118,11 @@ class Lessons:
 
     Args:
         robots: robots that act in them.
+        logs: folder of `demos` shards, episodes of the simulator from their start to their end; opened when it is needed.
     """
 
-    def __init__(self, robots: Sequence[str] = PAPER_ROBOTS) -> None:
-        self._robots = tuple(robots)
+    def __init__(self, robots: Sequence[str] = PAPER_ROBOTS, logs: Path | None = None) -> None:
+        self._robots, self._folder = tuple(robots), logs
 
     def words(self) -> tuple[str, ...]:
         """Every word but made-up names: markers, the grammar of actions, all types of the catalogue, all wordings of tasks."""
@@ -135,7 +140,9 @@ class Lessons:
         """The episode of a seed in the text world, with the teacher's answers; some steps that are taken are mistakes."""
         episode = WordsOnly(seed, robots=self._robots)
         rng, world = episode.rng, episode.world
-        teacher, record = ScriptedPlanner(), _Record(_new_names(episode.task.objects, episode.scene.furniture, rng))
+        task = episode.task
+        things = dict.fromkeys((*task.objects, *task.objects.values(), *episode.scene.furniture))
+        teacher, record = ScriptedPlanner(), _Record(_new_names(tuple(things), set(task.objects), rng))
         mistakes = float(rng.choice(_MISTAKES))
         while episode.steps < _MAX_STEPS:
             shown = episode.shown()
@@ -148,6 +155,57 @@ class Lessons:
             record.look(shown, step, job.verb, job.target)
             episode.take(world.mistake(step) if rng.random() < mistakes else step)
         return record.episode()
+
+    def logged(self, seed: int) -> WordEpisode:
+        """An episode of the logs, drawn with a seed, and the teacher's answers; for a negative one from those held out.
+
+        Raises:
+            ValueError: when no logs were given.
+            data.shards.ShardError: when they cannot be read.
+        """
+        rng = rng_for("lesson of a log", seed)
+        logs = self._logs.held_out if seed < 0 else self._logs.train
+        looks, done = logs[int(rng.integers(len(logs)))]
+        start = set(looks[0].known_objects)
+        moved = {name for name in looks[-1].known_objects if name not in start}
+        teacher, record = ScriptedPlanner(), _Record(_new_names(looks[-1].known_objects, moved, rng))
+        for number, shown in enumerate(looks, 1):
+            step, job = teacher.decide(shown)
+            if done and number == len(looks):
+                record.look(shown, PlanStep((Action("Done"),)), "Done", "")
+            elif job is not None:
+                record.look(shown, step, job.verb, job.target)
+            else:  # it gives up
+                break
+        return record.episode()
+
+    @functools.cached_property
+    def _logs(self) -> _Logs:
+        if self._folder is None:
+            raise ValueError("no folder of logs was given")
+        return _Logs(self._folder)
+
+
+class _Logs:
+    """Episodes of the simulator in words: what was shown before every step, and whether the goals were met at the end.
+
+    Attributes:
+        train: episodes to learn from.
+        held_out: one in twenty, one at least.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        reader = ShardReader(folder, "demos")
+        columns = [reader.column(name) for name in ("episode", "instruction", "robot", "visible", "known", "history", "target")]
+        episodes: dict[str, list[Shown]] = {}
+        done: dict[str, bool] = {}
+        for episode, instruction, robot, visible, known, history, target in zip(*columns, strict=True):
+            items = tuple(HistoryItem(**item) for item in history)
+            episodes.setdefault(episode, []).append(Shown(instruction, robot, tuple(visible), tuple(known), items))
+            done[episode] = target == "Done()"
+        kept_back = {name for name in episodes if held_out(name)} or set(list(episodes)[:1])
+        self.train = [(looks, done[name]) for name, looks in episodes.items() if name not in kept_back]
+        self.held_out = [(looks, done[name]) for name, looks in episodes.items() if name in kept_back]
 
 
 class _Record:
@@ -217,12 +275,12 @@ def _names_pattern() -> tuple[re.Pattern[str], dict[str, tuple[str, bool]]]:
     return re.compile(rf"\b(?:{'|'.join(longest)})\b", re.IGNORECASE), types
 
 
-def _new_names(objects: Mapping[str, str], furniture: Sequence[str], rng: np.random.Generator) -> dict[str, str]:
-    """Made-up names of some types, of one or two words; none in half of the episodes."""
+def _new_names(ids: Sequence[str], often: Set[str], rng: np.random.Generator) -> dict[str, str]:
+    """Made-up names of some types of some ids, of one or two words, more often of some; none in half of the episodes."""
     if rng.random() >= _RENAMED:
         return {}
-    types = list(dict.fromkeys(name.rsplit("_", 1)[0] for name in (*objects, *objects.values(), *furniture)))
-    weights = np.array([3.0 if any(name.startswith(f"{kind}_") for name in objects) else 1.0 for kind in types])
+    types = list(dict.fromkeys(name.rsplit("_", 1)[0] for name in ids))
+    weights = np.array([3.0 if any(name.startswith(f"{kind}_") for name in often) else 1.0 for kind in types])
     count = min(int(rng.integers(1, _MOST_RENAMED + 1)), len(types))
     chosen = rng.choice(len(types), count, replace=False, p=weights / weights.sum())
     return {types[int(index)]: "".join(_made_up_word(rng) for _ in range(int(rng.integers(1, 3)))) for index in chosen}

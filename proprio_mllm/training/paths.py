@@ -33,7 +33,7 @@ class StagePaths:
         self.variant = cfg.variant
 
     def shards(self, kind: str) -> Path:
-        """Folder of shards: `clips`, `views`, `text_planning`, `goal_questions`, `demos`, `dagger` or `dagger_in_text`."""
+        """Folder of shards: `views`, `demos` …; docs/data.md lists them."""
         return self.root / "data" / kind
 
     def stage(self, name: str) -> Path:

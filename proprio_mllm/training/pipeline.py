@@ -53,6 +53,10 @@ class LessonSource(Protocol):
         """The episode of a seed; negative ones are held out."""
         ...
 
+    def logged(self, seed: int) -> WordEpisode:
+        """An episode of the simulator, drawn with a seed; negative ones are held out."""
+        ...
+
 
 class Stage(Protocol):
     """One stage of training.

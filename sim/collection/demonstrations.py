@@ -8,6 +8,9 @@ have led, to the goal. Paper: planning demonstrations; what the paper takes from
 With a student, its steps are executed in place of the expert's (DAgger, Ross et al. 2011): what is recorded is what the expert
 would do where a learned planner's own mistakes have led it. The student gets no say where it repeats a step that just failed or
 ends the episode, in a share of the steps, and after as many steps as the task allows; the expert then finishes the episode.
+
+Lessons are episodes with another teacher, a function of what a planner sees, at the controls: right steps, mistakes and a
+student's steps, each kept with the teacher's answer whether the goals are met in the end or not.
 """
 
 from __future__ import annotations
@@ -26,24 +29,32 @@ from data.interface.steps import Action, PlanStep
 from data.shards import encode_png
 from sim.expert.expert import Expert
 from sim.session.session import Session
+from sim.tasks.families import CATEGORIES, FAMILIES
 from sim.tasks.sample import TRAIN_SEEDS, rng_for, sample_task
 from sim.tasks.task import Task
 
 __all__ = [
+    "CATEGORY_SHARES",
     "Episode",
     "Student",
+    "Teacher",
     "accepted",
     "dagger_of_part",
     "demos_of_part",
+    "lessons_of_part",
     "perturbed",
     "run_dagger_episode",
     "run_episode",
+    "run_lesson",
 ]
 
 #: Plays one episode of a collection with the sessions it may reuse.
 Play = Callable[[CollectConfig, int, dict[tuple[str, str], Session]], "Episode"]
 #: A planner that learns: the step it would take, None when its reply is no step.
 Student = Callable[[Observation], PlanStep | None]
+#: The step that should be taken and the action that it works towards; None where the teacher gives up. It is shown an episode's
+#: observations one after the other.
+Teacher = Callable[[Observation], tuple[PlanStep, Action | None] | None]
 
 #: Training seeds of one collection seed; two collections do not share tasks.
 _SEEDS_PER_COLLECTION: Final = 1_000_000
@@ -55,6 +66,12 @@ _STUDENT_REHEARSALS: Final = 16
 _FINISH: Final = 10
 #: Episodes with a student take their tasks from here on, so that they share none with the expert's own.
 _STUDENT_FROM: Final = 500_000
+#: The same for lessons, the steps after which one ends, and shares of steps that are mistakes, one drawn per lesson.
+_LESSONS_FROM: Final = 700_000
+_LESSON_STEPS: Final = 32
+_MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
+#: How often a lesson is of each category. Two things for two arms are learnt last.
+CATEGORY_SHARES: Final = (0.2, 0.5, 0.3)
 
 
 @dataclass(slots=True)
@@ -122,12 +139,12 @@ def accepted(proposed: PlanStep | None, last: HistoryItem | None) -> PlanStep | 
     return None if last.step == proposed.to_text() else proposed
 
 
-def _rows_of_part(config: CollectConfig, part: int, play: Play) -> Iterator[dict[str, Any]]:
+def _rows_of_part(config: CollectConfig, part: int, play: Play, all_kept: bool = False) -> Iterator[dict[str, Any]]:
     sessions: dict[tuple[str, str], Session] = {}
     try:
         for index in config.indices(part):
             episode = play(config, index, sessions)
-            if episode.success:
+            if episode.success or all_kept:
                 yield from episode.rows
     finally:
         for session in sessions.values():
@@ -167,17 +184,79 @@ def run_dagger_episode(
     return episode
 
 
+def lessons_of_part(
+    config: CollectConfig, part: int, teacher: Teacher, student: Student | None = None
+) -> Iterator[dict[str, Any]]:
+    """Rows of one part of a `demos` folder of lessons."""
+    yield from _rows_of_part(
+        config, part, lambda cfg, index, sessions: run_lesson(cfg, index, sessions, teacher, student), all_kept=True
+    )
+
+
+def run_lesson(
+    config: CollectConfig,
+    index: int,
+    sessions: dict[tuple[str, str], Session] | None,
+    teacher: Teacher,
+    student: Student | None = None,
+) -> Episode:
+    """Plays one lesson; the last row's target is `Done` where the goals were met.
+
+    Args:
+        config: the collection; with a student, `noise` is the share of steps that the teacher takes itself.
+        index: number of the lesson; names its task, robot and every draw.
+        sessions: sessions by (robot, difficulty), reused between episodes.
+        teacher: names the right step.
+        student: the learned planner; without one the steps are the teacher's, with mistakes.
+    """
+    rng = rng_for("lessons", config.seed, index)
+    category = str(rng.choice(CATEGORIES, p=CATEGORY_SHARES))
+    family = str(rng.choice([name for name, kind in FAMILIES.items() if kind.category == category]))
+    sessions = {} if sessions is None else sessions
+    robot, task, session, observation = _start(config, _LESSONS_FROM + index, rng, sessions, family=family)
+    session.step_limit = _LESSON_STEPS
+    mistakes = float(rng.choice(_MISTAKES))
+    episode = Episode()
+    done = PlanStep((Action("Done"),))
+    while not session.finished:
+        answer = teacher(observation)
+        if answer is None:
+            break
+        target, intent = answer
+        step, origin = target, "teacher"
+        if student is None and rng.random() < mistakes:
+            step, origin = perturbed(target, observation, rng, intent)
+        if student is not None:
+            own = student(observation)  # which has to see every observation
+            proposed = accepted(own, observation.history[-1] if observation.history else None)
+            if proposed is not None and rng.random() >= config.noise:
+                step, origin = proposed, "student"
+        executed = {"executed": step.to_text(), "origin": origin}
+        episode.rows.append(_row(observation, task, robot, _LESSONS_FROM + index, target, executed))
+        observation, _ = session.step(step)
+    episode.success, episode.steps = session.succeeded, len(episode.rows)
+    if episode.success:
+        nothing = {"executed": done.to_text(), "origin": "teacher"}
+        episode.rows.append(_row(observation, task, robot, _LESSONS_FROM + index, done, nothing))
+    return episode
+
+
 def _start(
     config: CollectConfig,
     index: int,
     rng: np.random.Generator,
     sessions: dict[tuple[str, str], Session],
     extra_steps: int = 0,
+    family: str | None = None,
 ) -> tuple[str, Task, Session, Observation]:
-    """Opens the episode's task."""
+    """Opens the episode's task, of a family where the room allows it."""
     robot = config.robots[index % len(config.robots)]
     room = config.rooms[(index // len(config.robots)) % len(config.rooms)]
-    task = sample_task(TRAIN_SEEDS.start + config.seed * _SEEDS_PER_COLLECTION + index, room, robots=(robot,))
+    seed = TRAIN_SEEDS.start + config.seed * _SEEDS_PER_COLLECTION + index
+    try:
+        task = sample_task(seed, None if family else room, family, robots=(robot,))
+    except ValueError:
+        task = sample_task(seed, room, robots=(robot,))
     task = replace(task, time_limit=task.time_limit + extra_steps)
     difficulty = "medium" if rng.random() < config.medium_share else "easy"
     session = sessions.setdefault((robot, difficulty), Session(robot, difficulty, config.image_size))

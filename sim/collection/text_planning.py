@@ -24,7 +24,7 @@ from configs.schema.collect import CollectConfig
 from data.interface.failures import INVALID_OUTPUT
 from data.interface.observation import HistoryItem
 from data.interface.steps import PlanStep
-from sim.collection.demonstrations import accepted
+from sim.collection.demonstrations import CATEGORY_SHARES, accepted
 from sim.collection.text_world import TextWorld, feedback_text
 from sim.robots.spec import load_robot
 from sim.tasks.drafts import Draft, NoDraft, Scene
@@ -46,8 +46,6 @@ _HISTORY: Final = 8
 _MAX_STEPS: Final = 24
 #: Shares of steps that are mistakes, one drawn per episode.
 _MISTAKES: Final = (0.1, 0.3, 0.5)
-#: How often a task is of each category. Two things for two arms are learnt last.
-_SHARES: Final = (0.2, 0.5, 0.3)
 #: Furniture of made-up rooms.
 _SURFACES: Final = ("CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser", "Shelf")
 _ROOMY: Final = ("CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser")
@@ -235,7 +233,7 @@ def draw_task(rooms: Sequence[str], rng: np.random.Generator) -> tuple[Draft, Sc
     """A task in one of some rooms or in a made-up one."""
     while True:
         scene = scene_of(str(rng.choice(rooms))) if rng.random() < 0.5 else _made_up(rng)
-        category = str(rng.choice(CATEGORIES, p=_SHARES))
+        category = str(rng.choice(CATEGORIES, p=CATEGORY_SHARES))
         family = str(rng.choice([name for name in FAMILIES if FAMILIES[name].category == category]))
         try:
             return draw(family, scene, rng), scene

@@ -26,17 +26,27 @@ from sim.tasks.drafts import Draft, Scene
 __all__ = ["TextWorld", "feedback_text"]
 
 _HEIGHT_STEP_M: Final = 0.05
-#: Pelvis heights relative to upright, metres.
-_LOWEST_M, _HIGHEST_M = -0.5, 0.0
+#: Pelvis heights relative to upright, metres: those at the start, the lowest ones of a robot in its room, the highest one.
+_STARTS_M: Final = (0.0, -0.05, -0.1, -0.2, -0.3)
+_LOWEST_M: Final = (-0.25, -0.35, -0.5)
+_HIGHEST_M: Final = 0.0
 #: What physics says to an action that was right, with a probability: once, or every time from the same stance.
 _BAD_LUCK: Final = 0.02
 _AWKWARD: Final = 0.08
-#: How often what one has walked to is still out of reach: arms that are solved apart from the waist do not lean. These and the
-#: next figures were measured with the teacher's steps.
-_FAR: Final = {"whole_body": 0.08, "per_arm": 0.33}
-#: How often a walk is blocked, and how often one to a chosen distance has no free end.
-_BLOCKED: Final = 0.05
+#: How often what one has walked to is still out of reach: arms that are solved apart from the waist do not lean. Some things
+#: lie so that it is nearly always: how many of them, and how often then. These and the next figures were measured with the
+#: teacher's steps.
+_FAR: Final = {"whole_body": 0.08, "per_arm": 0.3}
+_AWKWARD_PLACE: Final = {"whole_body": 0.1, "per_arm": 0.15}
+_FAR_THERE: Final = 0.75
+#: How often a walk, a turn or a step aside is blocked, and how often a walk to a chosen distance has no free end.
+_BLOCKED: Final = {"GoTo": 0.05, "RotateLeft": 0.05, "RotateRight": 0.05}
+_BLOCKED_STEP: Final = 0.2
 _NO_POSE: Final = 0.35
+#: How often each thing in front is seen on arrival, and with each further look that shows more of it.
+_AT_ONCE: Final = 0.75
+_LOOK: Final = {"MoveUp": 0.6, "MoveDown": 0.1}
+_LOOK_ASIDE: Final = 0.4
 #: How often a door with a spring does not fall quite shut.
 _AJAR: Final = {"whole_body": 0.05, "per_arm": 0.5}
 #: How far, up and down, the pelvis may be from the height at which a piece of furniture is reached best, metres.
@@ -74,7 +84,8 @@ class TextWorld:
     def __init__(self, draft: Draft, scene: Scene, robot: RobotSpec, rng: np.random.Generator) -> None:
         self._draft, self._scene, self._rng, self._solver = draft, scene, rng, robot.solver
         self.facts = TextFacts(draft, scene, robot)
-        self._height_m = float(rng.choice((0.0, -0.1, -0.2, -0.3)))
+        self._height_m = float(rng.choice(_STARTS_M))
+        self._lowest_m = float(rng.choice(_LOWEST_M))
         self._bands = {name: self._band() for name in scene.furniture}
         #: Whether a refusal has told the robot that its height is wrong here.
         self._told = False
@@ -84,7 +95,10 @@ class TextWorld:
         #: What does not work from this stance, and how often the robot has come to this place anew.
         self._awkward: dict[Action, FailureCode] = {}
         self._approaches = 0
-        self._at, self._near, self._left_first = "", set[str](), False
+        self._at, self._front, self._near, self._left_first = "", "", set[str](), False
+        far = _FAR[self._solver]
+        hard = {name: rng.random() < _AWKWARD_PLACE[self._solver] for name in (*scene.furniture, *draft.objects)}
+        self._far = {name: _FAR_THERE if is_hard else far for name, is_hard in hard.items()}
         focus = next(iter(draft.focus.values()))
         there = rng.random() < 0.45
         self._arrive(
@@ -139,21 +153,21 @@ class TextWorld:
         if place != self._at:
             self._approaches = 0
             self._awkward.clear()
-        self._at, self._told = place, False
+        self._at = self._front = place
+        self._told = False
         self._left_first = bool(self._rng.random() < 0.35)
         ids = self._scene.furniture
         here = ids.index(place)
         beside = [ids[i] for i in range(max(0, here - 2), min(len(ids), here + 3)) if i != here and self._rng.random() < 0.4]
         shown = {place, *beside}
         objs = [name for name in self.facts.objs if self._place(name) in shown and not self.facts.hidden(name)]
-        seen = [name for name in objs if name == wanted or self._rng.random() < 0.85]
+        seen = [name for name in objs if name == wanted or self._rng.random() < _AT_ONCE]
         self.seen.update(seen)
         self.visible = [*(name for name in ids if name in shown), *(name for name in self.facts.objs if name in seen)]
         self._near = set()
         if near:
-            far = _FAR[self._solver]
-            self._near = {name for name in objs if self._rng.random() < (1.0 - far if name == wanted else 0.6)}
-            if wanted != place or self._rng.random() >= far:
+            self._near = {name for name in objs if self._rng.random() < (1.0 - self._far[name] if name == wanted else 0.6)}
+            if wanted != place or self._rng.random() >= self._far[place]:
                 self._near.add(place)
 
     def done(self) -> bool:
@@ -260,7 +274,7 @@ class TextWorld:
             place = self._place(target)
             if place is None or (action.amount is not None and self._rng.random() < _NO_POSE):
                 return FailureCode.NO_FREE_POSE
-            if self._rng.random() < _BLOCKED:
+            if self._rng.random() < _BLOCKED[action.name]:
                 return FailureCode.BLOCKED_PATH
             if place == self._at and self._awkward and (action.bearing_deg or action.amount):  # the plain stance is the old one
                 self._approaches += 1
@@ -268,26 +282,33 @@ class TextWorld:
             self._arrive(place, wanted=target)
         elif action.name in _LEGS:
             change = action.given_amount * (1 if action.name == "MoveUp" else -1)
-            if not _LOWEST_M <= self._height_m + change <= _HIGHEST_M:
-                self._height_m = _HIGHEST_M if change > 0 else _LOWEST_M
+            if not self._lowest_m <= self._height_m + change <= _HIGHEST_M:
+                self._height_m = _HIGHEST_M if change > 0 else self._lowest_m
                 self._awkward.clear()
                 return FailureCode.HEIGHT_LIMIT
             self._height_m += change
             self._told = False
             self._awkward.clear()
+            self._look(_LOOK[action.name])
+        elif self._rng.random() < _BLOCKED.get(action.name, _BLOCKED_STEP):
+            return FailureCode.BLOCKED_PATH
         else:
             self._look_around()
         self.facts.succeed(action, self._at)
         return "ok"
 
     def _look_around(self) -> None:
-        """After a turn or a step the stance is another one; what stands here comes into view."""
+        """After a turn or a step the stance is another one."""
         self._awkward.clear()
-        objs = self._standing_at(self._at)
-        self.seen.update(objs)
-        self.visible += [name for name in objs if name not in self.visible]
+        self._look(_LOOK_ASIDE)
         if self._rng.random() < 0.7:
             self._near = set()
+
+    def _look(self, share: float) -> None:
+        """Some of what stands in front comes into view."""
+        objs = [name for name in self._standing_at(self._front) if self._rng.random() < share]
+        self.seen.update(objs)
+        self.visible += [name for name in objs if name not in self.visible]
 
     def _change(self, action: Action) -> None:
         target = action.object_id or ""

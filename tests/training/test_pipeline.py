@@ -95,7 +95,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
     small = dataclasses.replace(cfg, model=_small(cfg.model))
     (root / "tiny").mkdir()
     shutil.copytree(shards, root / "tiny" / "data")
-    pipeline = Pipeline(STAGES, small, collect, "python train.py stage=all", correct, Lessons())
+    lessons = shutil.copytree(shards / "demos", root / "tiny" / "data" / "lessons")
+    pipeline = Pipeline(STAGES, small, collect, "python train.py stage=all", correct, Lessons(logs=lessons))
     for stage in STAGES:
         assert pipeline.run(stage) is not None
     return pipeline

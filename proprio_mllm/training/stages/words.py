@@ -9,6 +9,7 @@ from typing import Any
 
 from proprio_mllm.model.building import build_model, build_processor, save_model
 from proprio_mllm.model.word_tokens import add_word_tokens
+from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError, base_model_config
 from proprio_mllm.training.words import WordsObjective, held_out
 
@@ -16,12 +17,12 @@ __all__ = ["WordsStage"]
 
 
 class WordsStage:
-    """One loop over episodes that are made as they are needed."""
+    """One loop over episodes that are made as they are needed, and some that the simulator wrote."""
 
     name = "words"
     needs = ()
-    shards = ()
-    recipe = 0
+    shards = ("lessons",)
+    recipe = 1
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The loop and the plain backbone."""
@@ -30,16 +31,22 @@ class WordsStage:
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
         """Trains and stores the model; measures it on episodes that it was not trained on."""
-        if pipeline.lessons is None:
+        lessons, share = pipeline.lessons, pipeline.cfg.words.logged
+        if lessons is None:
             raise StageError("stage 'words' needs a source of lessons: run it with `python train.py stage=words`")
         cfg = dataclasses.replace(base_model_config(pipeline.cfg.model), episodes=True)
-        words = pipeline.lessons.words()
+        words = lessons.words()
         processor = build_processor(cfg, [" ".join(words)] * 2)
         add_word_tokens(processor.tokenizer, words)
         model = build_model(cfg, processor, pipeline.cfg.seed)
         model.requires_grad_(False)
         model.core.model.language_model.requires_grad_(True)
-        objective = WordsObjective(model, pipeline.lessons.episode, key, pipeline.cfg.words.reading)
+
+        def episode(seed: int) -> WordEpisode:
+            return lessons.logged(seed) if seed % 1000 < 1000 * share else lessons.episode(seed)
+
+        objective = WordsObjective(model, episode, key, pipeline.cfg.words.reading)
         pipeline.loop(objective, pipeline.cfg.words.loop, folder / "loop")
         save_model(model.eval(), pipeline.paths.model("words"))
-        return held_out(model, pipeline.lessons.episode)
+        measured = held_out(model, lessons.episode)
+        return measured | {f"{name}_logged": value for name, value in held_out(model, lessons.logged).items()}

@@ -13,7 +13,7 @@ from data.interface.steps import Action, PlanStep
 from data.motion import N_FEATURES
 from data.shards import ShardReader, decode_depth, decode_png, decode_segmentation
 from sim.collection.collect import collect, main, parts_of, rows_of_part
-from sim.collection.demonstrations import perturbed, run_dagger_episode, run_episode
+from sim.collection.demonstrations import perturbed, run_dagger_episode, run_episode, run_lesson
 from sim.collection.view_sampling import type_names
 
 VIEWS = CollectConfig("views", "unused", 6, part_size=3, views_per_world=3, image_size=56)
@@ -113,6 +113,27 @@ def test_a_students_mistakes_are_recorded_with_the_experts_step():
     # a step that has just failed is not tried again: the expert takes over
     assert [note["origin"] for note in notes[:2]] == ["student", "expert"]
     assert run_dagger_episode(config, 10, None, lambda observation: None).rows[-1]["target"] == episode.rows[-1]["target"]
+
+
+def test_a_lesson_keeps_the_teachers_answer_to_every_step_and_ends_with_done():
+    config = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, medium_share=0.0)
+    shown = []
+
+    def teacher(observation):
+        shown.append(observation)
+        return PlanStep((Action("RotateLeft", amount=10.0),)), None
+
+    def student(observation):
+        return PlanStep((Action("Place", arm=Arm.RIGHT, object_id=observation.known_objects[0]),))
+
+    alone, taught = run_lesson(config, 3, None, teacher), run_lesson(config, 3, None, teacher, student)
+    assert len(alone.rows) == len(taught.rows) == 32
+    assert {row["target"] for row in (*alone.rows, *taught.rows)} == {"RotateLeft(10)"}
+    assert [row["image"] for row in alone.rows] == [row["image"] for row in run_lesson(config, 3, None, teacher).rows]
+    assert [len(observation.history) for observation in shown[:32]] == list(range(32))
+    origins = [json.loads(row["privileged"])["origin"] for row in taught.rows]
+    assert origins[:2] == ["student", "teacher"]  # what has just failed is not tried again
+    assert run_lesson(config, 3, None, lambda observation: None).rows == []
 
 
 class _Seen:

@@ -38,7 +38,7 @@ def test_an_episode_is_a_function_of_its_number(episodes: list[TextEpisode]) -> 
 
 
 def test_most_episodes_end_in_success_in_spite_of_mistakes(episodes: list[TextEpisode]) -> None:
-    assert sum(episode.success for episode in episodes) > 255
+    assert sum(episode.success for episode in episodes) > 235
     codes = set().union(*(episode.codes for episode in episodes))
     wanted = {"ok", "TooFar", "BodyTooHigh", "BodyTooLow", "HandEmpty", "HandOccupied", "AlreadyHeld", "AlreadyInState"}
     assert wanted | {"ObjectNotKnown", "BothHandsBusy", "GraspMissed"} <= codes
