@@ -2,7 +2,7 @@
 
 Stages: data (motions to clips shards), collect (views, planning in words, demonstrations, lessons), base, dagger (the base
 model acts, the expert corrects it), pointmap, tokenizer, alignment, selu; `all` runs them in order and skips what is current.
-`words` (whole episodes in words) is run by its name: no other stage starts from it. Options: configs/schema/train.py.
+`words` (whole episodes in words) and `practice` (more, from acting) are run by name. Options: configs/schema/train.py.
 """
 
 from __future__ import annotations
@@ -84,7 +84,6 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
     import torch
 
     from proprio_mllm.evaluation.lessons import Lessons
-    from proprio_mllm.training.paths import StagePaths
     from proprio_mllm.training.pipeline import Pipeline, StageError
     from proprio_mllm.training.stages import STAGES
 
@@ -93,10 +92,9 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
     command = " ".join(["python train.py", *sys.argv[1:]])
     robots = cfg.data.robots
     pipeline = Pipeline(
-        STAGES, cfg, partial(_rollouts, robots=robots), command, partial(_dagger, robots=robots),
-        Lessons(robots, StagePaths(cfg).shards("lessons")),
-    )  # fmt: skip
-    wanted = tuple(name for name in STAGES if name != "words") if cfg.stage == "all" else (cfg.stage,)
+        STAGES, cfg, partial(_rollouts, robots=robots), command, partial(_dagger, robots=robots), Lessons(robots)
+    )
+    wanted = tuple(name for name in STAGES if name not in ("words", "practice")) if cfg.stage == "all" else (cfg.stage,)
     metrics = {name: pipeline.run(name) for name in wanted}
     if cfg.release is not None:
         from proprio_mllm.training.release import export

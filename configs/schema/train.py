@@ -16,6 +16,7 @@ __all__ = [
     "DaggerConfig",
     "LoggerConfig",
     "LoopConfig",
+    "PracticeConfig",
     "SeluConfig",
     "StageName",
     "TrainConfig",
@@ -25,7 +26,9 @@ __all__ = [
 
 #: Training tasks have 2^31 seeds, a million for each seed of a run.
 LARGEST_SEED = 2000
-StageName = Literal["all", "data", "collect", "words", "base", "dagger", "pointmap", "tokenizer", "alignment", "selu"]
+StageName = Literal[
+    "all", "data", "collect", "words", "practice", "base", "dagger", "pointmap", "tokenizer", "alignment", "selu"
+]
 Variant = Literal["full", "no_mpe", "no_cse", "no_mpe_cse", "no_proprio"]
 
 
@@ -118,6 +121,33 @@ class WordsConfig:
 
     def __post_init__(self) -> None:
         _require_shares(self, "reading", "logged")
+
+
+@dataclass(frozen=True)
+class PracticeConfig:
+    """`stage=practice`: the words model acts on training tasks, the teacher answers, both worlds are learnt from.
+
+    Attributes:
+        loop: an example is an episode.
+        episodes: how many the model acts in.
+        teacher_share: share of their steps that the teacher takes itself.
+        own_share: share of what is learnt that is from those episodes.
+        logged: share that is from the teacher's own episodes in the simulator; the rest is of the text world.
+        workers: processes.
+    """
+
+    loop: LoopConfig
+    episodes: int = 300
+    teacher_share: float = 0.25
+    own_share: float = 0.2
+    logged: float = 0.2
+    workers: int = 2
+
+    def __post_init__(self) -> None:
+        _require_shares(self, "teacher_share", "own_share", "logged")
+        require(self.own_share + self.logged <= 1.0, f"own_share {self.own_share} and logged {self.logged} exceed 1 together")
+        for name in ("episodes", "workers"):
+            require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
 
 
 @dataclass(frozen=True)
@@ -246,6 +276,7 @@ class TrainConfig:
             stages bring without proprioception.
         model: the model.
         words: `stage=words`.
+        practice: `stage=practice`.
         output: folder of all outputs.
         seed: seed of data order, initial weights and rollouts.
         threads: torch threads; 0 leaves torch's choice.
@@ -266,6 +297,7 @@ class TrainConfig:
     alignment: AlignmentConfig
     selu: SeluConfig
     words: WordsConfig
+    practice: PracticeConfig
     data: DataConfig = field(default_factory=DataConfig)
     collect: CollectStageConfig = field(default_factory=CollectStageConfig)
     dagger: DaggerConfig = field(default_factory=DaggerConfig)

@@ -22,7 +22,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -54,49 +54,63 @@ def collect_dagger(request: DaggerRequest, robots: Sequence[str] = PAPER_ROBOTS,
         robots: robots, in turn.
         workers: processes; 1 stays in this one.
     """
-    writer = ShardWriter(request.folder, request.kind, request.config_hash, overwrite=True)
-    size = _PER_PART[request.kind]
+    kind: Literal["demos", "text_planning"] = "demos" if request.kind == "lessons" else request.kind
     config = CollectConfig(
-        request.kind, str(request.folder), request.episodes, tuple(robots), seed=request.seed, image_size=request.image_size,
-        part_size=size, noise=request.expert_share,
+        kind, str(request.folder), request.episodes, tuple(robots), seed=request.seed, image_size=request.image_size,
+        part_size=_PER_PART[kind], noise=request.expert_share, workers=workers,
     )  # fmt: skip
-    count = -(-request.episodes // size)
-    missing = writer.missing(count)
-    with tqdm(total=count, initial=count - len(missing), desc=f"dagger ({request.kind})", unit="part") as bar:
-        for part, rows in _computed(functools.partial(_part, config, model=str(request.model)), missing, workers):
-            writer.write(part, rows)
-            bar.update(1)
-    writer.finish({"student": str(request.model), "expert_share": request.expert_share})
+    model = str(request.model)
+    job = (
+        functools.partial(_lessons, config, student=model)
+        if request.kind == "lessons"
+        else functools.partial(_part, config, model=model)
+    )
+    with tqdm(desc=f"dagger ({request.kind})", unit="part") as bar:
+
+        def report(done: int, parts: int) -> None:
+            bar.total, bar.n = parts, done
+            bar.refresh()
+
+        about = {"student": model, "expert_share": request.expert_share}
+        _write(config, request.config_hash, job, about, report, overwrite=True)
 
 
 def collect_lessons(
-    config: CollectConfig,
-    progress: Callable[[int, int], None] | None = None,
-    overwrite: bool = False,
-    student: Path | None = None,
+    config: CollectConfig, progress: Callable[[int, int], None] | None = None, overwrite: bool = False
 ) -> Manifest:
-    """Writes a complete folder of lessons in the simulator, as `demos` shards; an interrupted one is continued part by part.
+    """Writes a complete folder of the teacher's lessons in the simulator; an interrupted one is continued part by part.
 
     Args:
         config: how many, of whom, and where they go.
         progress: called with (parts done, parts in all).
         overwrite: start over when the folder holds something else.
-        student: folder of a words model that acts in them; None for the teacher with mistakes.
     """
     keyed = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "workers")}
-    writer = ShardWriter(Path(config.out), config.kind, config_hash({**keyed, "version": 1}), overwrite)
+    keyed["version"] = 1
+    report = progress or (lambda done, parts: None)
+    return _write(config, config_hash(keyed), functools.partial(_lessons, config), {"config": keyed}, report, overwrite)
+
+
+def _write(
+    config: CollectConfig,
+    key: str,
+    job: Callable[[int], list[dict[str, Any]]],
+    about: Mapping[str, Any],
+    progress: Callable[[int, int], None],
+    overwrite: bool,
+) -> Manifest:
+    """Writes the parts that are missing; `job` computes one."""
+    writer = ShardWriter(Path(config.out), config.kind, key, overwrite)
     total = -(-config.count // config.part_size)
     missing = writer.missing(total)
-    report = progress or (lambda done, parts: None)
-    report(total - len(missing), total)
-    job = functools.partial(_lessons, config, student=None if student is None else str(student))
-    for count, (part, rows) in enumerate(_computed(job, missing, config.workers), total - len(missing) + 1):
+    progress(total - len(missing), total)
+    for done, (part, rows) in enumerate(_computed(job, missing, config.workers), total - len(missing) + 1):
         writer.write(part, rows)
-        report(count, total)
-    return writer.finish({"config": keyed, "student": None if student is None else str(student)})
+        progress(done, total)
+    return writer.finish(about)
 
 
-def _lessons(config: CollectConfig, part: int, student: str | None) -> list[dict[str, Any]]:
+def _lessons(config: CollectConfig, part: int, student: str | None = None) -> list[dict[str, Any]]:
     """One part of a folder of lessons."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     from sim.collection.demonstrations import lessons_of_part

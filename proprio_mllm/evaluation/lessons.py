@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -118,11 +118,10 @@ class Lessons:
 
     Args:
         robots: robots that act in them.
-        logs: folder of `demos` shards, episodes of the simulator from their start to their end; opened when it is needed.
     """
 
-    def __init__(self, robots: Sequence[str] = PAPER_ROBOTS, logs: Path | None = None) -> None:
-        self._robots, self._folder = tuple(robots), logs
+    def __init__(self, robots: Sequence[str] = PAPER_ROBOTS) -> None:
+        self._robots = tuple(robots)
 
     def words(self) -> tuple[str, ...]:
         """Every word but made-up names: markers, the grammar of actions, all types of the catalogue, all wordings of tasks."""
@@ -156,34 +155,38 @@ class Lessons:
             episode.take(world.mistake(step) if rng.random() < mistakes else step)
         return record.episode()
 
-    def logged(self, seed: int) -> WordEpisode:
-        """An episode of the logs, drawn with a seed, and the teacher's answers; for a negative one from those held out.
+    def logged(self, folder: Path) -> Callable[[int], WordEpisode]:
+        """Episodes of the simulator with the teacher's answers, each drawn with a seed; those of negative seeds are held out.
+
+        Args:
+            folder: `demos` shards of episodes from their start to their end.
 
         Raises:
-            ValueError: when no logs were given.
             data.shards.ShardError: when they cannot be read.
         """
-        rng = rng_for("lesson of a log", seed)
-        logs = self._logs.held_out if seed < 0 else self._logs.train
-        looks, done = logs[int(rng.integers(len(logs)))]
-        start = set(looks[0].known_objects)
-        moved = {name for name in looks[-1].known_objects if name not in start}
-        teacher, record = ScriptedPlanner(), _Record(_new_names(looks[-1].known_objects, moved, rng))
-        for number, shown in enumerate(looks, 1):
-            step, job = teacher.decide(shown)
-            if done and number == len(looks):
-                record.look(shown, PlanStep((Action("Done"),)), "Done", "")
-            elif job is not None:
-                record.look(shown, step, job.verb, job.target)
-            else:  # it gives up
-                break
-        return record.episode()
+        logs = _Logs(folder)
 
-    @functools.cached_property
-    def _logs(self) -> _Logs:
-        if self._folder is None:
-            raise ValueError("no folder of logs was given")
-        return _Logs(self._folder)
+        def episode(seed: int) -> WordEpisode:
+            rng = rng_for("lesson of a log", seed)
+            some = logs.held_out if seed < 0 else logs.train
+            return _of_log(*some[int(rng.integers(len(some)))], rng)
+
+        return episode
+
+
+def _of_log(looks: Sequence[Shown], done: bool, rng: np.random.Generator) -> WordEpisode:
+    """The episode in which a planner was shown this, and whose goals were met at its end or not."""
+    known = looks[-1].known_objects
+    teacher, record = ScriptedPlanner(), _Record(_new_names(known, set(known) - set(looks[0].known_objects), rng))
+    for number, shown in enumerate(looks, 1):
+        step, job = teacher.decide(shown)
+        if done and number == len(looks):
+            record.look(shown, PlanStep((Action("Done"),)), "Done", "")
+        elif job is not None:
+            record.look(shown, step, job.verb, job.target)
+        else:  # it gives up
+            break
+    return record.episode()
 
 
 class _Logs:

@@ -53,8 +53,8 @@ class LessonSource(Protocol):
         """The episode of a seed; negative ones are held out."""
         ...
 
-    def logged(self, seed: int) -> WordEpisode:
-        """An episode of the simulator, drawn with a seed; negative ones are held out."""
+    def logged(self, folder: Path) -> Callable[[int], WordEpisode]:
+        """Episodes of the simulator, each drawn with a seed; those of negative seeds are held out."""
         ...
 
 

@@ -33,12 +33,12 @@ __all__ = ["LARGEST_MB", "export", "find_model", "release_name"]
 
 #: Largest size of one released folder, megabytes.
 LARGEST_MB: Final = 30.0
-_MODELS: Final = ("words", "base", "alignment", "selu")
+_MODELS: Final = ("practice", "base", "alignment", "selu")
 
 
 def release_name(stage: str, variant: str) -> str:
-    """Name of a released model: `words`, `base`, the variant for the last stage's, `full-alignment` for the one before."""
-    return {"words": "words", "base": "base", "selu": variant}.get(stage, f"{variant}-{stage}")
+    """Name of a released model: `words` is of practice, the last stage's is the variant's."""
+    return {"practice": "words", "base": "base", "selu": variant}.get(stage, f"{variant}-{stage}")
 
 
 def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
@@ -69,12 +69,12 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
             continue
         key = pipeline.key(stage)
         target = Path(folder) / pipeline.cfg.model.name / release_name(stage, pipeline.cfg.variant)
-        if stage in ("words", "base") and _released_key(target) == key:  # every variant's export meets them again
+        if stage in ("practice", "base") and _released_key(target) == key:  # every variant's export meets them again
             continue
         with new_folder(target) as work:
             shutil.copytree(source, work, dirs_exist_ok=True)
             _shrink(work)
-            if stage not in ("words", "base") and (work / "vlm").is_dir():
+            if stage not in ("practice", "base") and (work / "vlm").is_dir():
                 share_backbone(work, target.with_name(release_name("base", "")))
             provenance = json.dumps(_provenance(pipeline, stage, key), indent=1)
             (work / "provenance.json").write_text(provenance + "\n", encoding="utf-8")
@@ -105,7 +105,8 @@ def _shrink(folder: Path) -> None:
 
 def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
     shards = {}
-    for kind in ("clips", "views", "text_planning", "goal_questions", "demos", "dagger", "dagger_in_text"):
+    kinds = ("clips", "views", "text_planning", "goal_questions", "demos", "dagger", "dagger_in_text", "lessons", "practice")
+    for kind in kinds:
         folder = pipeline.paths.shards(kind)
         if (folder / "manifest.json").is_file():
             shards[kind] = shard_hash(folder)
@@ -139,7 +140,7 @@ def find_model(output: str | Path, weights: str | Path, model: str, variant: str
     Raises:
         FileNotFoundError: when neither exists; the message names the command that trains it.
     """
-    group = "shared" if stage in ("words", "base") else variant
+    group = "shared" if stage in ("practice", "base") else variant
     trained = Path(output) / model / group / stage
     if finished_key(trained) is not None and (trained / "model").is_dir():
         return trained / "model"

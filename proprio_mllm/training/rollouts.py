@@ -56,7 +56,8 @@ class DaggerRequest:
     Attributes:
         model: folder of the model that acts.
         folder: shard folder to write.
-        kind: `demos` in the simulator, which drops episodes without success, or `text_planning` in words alone.
+        kind: `demos` in the simulator, which drops episodes without success, `text_planning` in words
+            alone, or `lessons`, which are `demos` of a words model and its teacher.
         episodes: number of episodes.
         seed: of tasks and draws.
         expert_share: share of the steps that the expert takes itself.
@@ -66,7 +67,7 @@ class DaggerRequest:
 
     model: Path
     folder: Path
-    kind: Literal["demos", "text_planning"]
+    kind: Literal["demos", "text_planning", "lessons"]
     episodes: int
     seed: int
     expert_share: float

@@ -24,7 +24,7 @@ from proprio_mllm.model.word_tokens import WordTokens, first_word
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.loop import Parts
 
-__all__ = ["WordBatch", "WordsObjective", "collate", "held_out", "rows_of", "words_loss"]
+__all__ = ["WordBatch", "WordsObjective", "collate", "held_out_metrics", "rows_of", "words_loss"]
 
 #: Decisions of a row, and rows that are computed together.
 _TURNS: Final = 6
@@ -226,11 +226,22 @@ def _learnt(batch: WordBatch) -> Tensor:
 
 
 @torch.no_grad()
-def held_out(model: ProprioMLLM, episode: Callable[[int], WordEpisode], count: int = 64) -> dict[str, float]:
-    """Exactness on episodes whose seeds training does not draw: negative ones."""
-    objective = WordsObjective(model, lambda seed: episode(-1 - seed % 2**31), "")
-    values = [objective.loss(model, part, torch.Generator())[1] for part in objective.batch(np.random.default_rng(0), count)]
-    return {
-        "held_out_loss": sum(value["answers"] for value in values),
-        "held_out_exact": sum(value["exact"] for value in values),
-    }
+def held_out_metrics(
+    model: ProprioMLLM, sources: Mapping[str, Callable[[int], WordEpisode]], count: int = 64
+) -> dict[str, float]:
+    """Loss and exactness on episodes whose seeds training does not draw: negative ones.
+
+    Args:
+        model: the model.
+        sources: episodes by the ending of the metrics' names.
+        count: episodes of each.
+    """
+    found: dict[str, float] = {}
+    for ending, episode in sources.items():
+        objective = WordsObjective(model, lambda seed, made=episode: made(-1 - seed % 2**31), "")
+        values = [
+            objective.loss(model, part, torch.Generator())[1] for part in objective.batch(np.random.default_rng(0), count)
+        ]
+        found[f"held_out_loss{ending}"] = sum(value["answers"] for value in values)
+        found[f"held_out_exact{ending}"] = sum(value["exact"] for value in values)
+    return found

@@ -66,8 +66,10 @@ _STUDENT_REHEARSALS: Final = 16
 _FINISH: Final = 10
 #: Episodes with a student take their tasks from here on, so that they share none with the expert's own.
 _STUDENT_FROM: Final = 500_000
-#: The same for lessons, the steps after which one ends, and shares of steps that are mistakes, one drawn per lesson.
+#: The same for lessons and for those of a student, the steps after which one ends, and shares of steps that are mistakes, one
+#: drawn per lesson.
 _LESSONS_FROM: Final = 700_000
+_PRACTICE_FROM: Final = 800_000
 _LESSON_STEPS: Final = 32
 _MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
 #: How often a lesson is of each category. Two things for two arms are learnt last.
@@ -212,8 +214,8 @@ def run_lesson(
     rng = rng_for("lessons", config.seed, index)
     category = str(rng.choice(CATEGORIES, p=CATEGORY_SHARES))
     family = str(rng.choice([name for name, kind in FAMILIES.items() if kind.category == category]))
-    sessions = {} if sessions is None else sessions
-    robot, task, session, observation = _start(config, _LESSONS_FROM + index, rng, sessions, family=family)
+    sessions, number = {} if sessions is None else sessions, (_LESSONS_FROM if student is None else _PRACTICE_FROM) + index
+    robot, task, session, observation = _start(config, number, rng, sessions, family=family)
     session.step_limit = _LESSON_STEPS
     mistakes = float(rng.choice(_MISTAKES))
     episode = Episode()
@@ -232,12 +234,12 @@ def run_lesson(
             if proposed is not None and rng.random() >= config.noise:
                 step, origin = proposed, "student"
         executed = {"executed": step.to_text(), "origin": origin}
-        episode.rows.append(_row(observation, task, robot, _LESSONS_FROM + index, target, executed))
+        episode.rows.append(_row(observation, task, robot, number, target, executed))
         observation, _ = session.step(step)
     episode.success, episode.steps = session.succeeded, len(episode.rows)
     if episode.success:
         nothing = {"executed": done.to_text(), "origin": "teacher"}
-        episode.rows.append(_row(observation, task, robot, _LESSONS_FROM + index, done, nothing))
+        episode.rows.append(_row(observation, task, robot, number, done, nothing))
     return episode
 
 

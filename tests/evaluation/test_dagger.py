@@ -84,7 +84,7 @@ def test_corrections_in_words_are_exercises(in_words: DaggerRequest) -> None:
 def test_training_keeps_its_threads(in_words: DaggerRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     threads, seen = torch.get_num_threads(), list[int]()
     asked = dagger._part
-    monkeypatch.setattr(dagger, "_part", lambda *job: (seen.append(torch.get_num_threads()), asked(*job))[1])
+    monkeypatch.setattr(dagger, "_part", lambda *job, **of: (seen.append(torch.get_num_threads()), asked(*job, **of))[1])
     try:
         torch.set_num_threads(2)
         collect_dagger(in_words, workers=1)

@@ -49,11 +49,11 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_teacher_answers_logs_as_it_did_in_the_simulator(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lessons, "_RENAMED", 0.0)
-    source, reader = Lessons(logs=logs), ShardReader(logs, "demos")
+    episode, reader = Lessons().logged(logs), ShardReader(logs, "demos")
     targets: dict[str, list[str]] = {}
     for name, target in zip(reader.column("episode"), reader.column("target"), strict=True):
         targets.setdefault(name, []).append(target)
-    told = [[_step(turn.answer) for turn in source.logged(seed).turns] for seed in (*range(12), *range(-12, 0))]
+    told = [[_step(turn.answer) for turn in episode(seed).turns] for seed in (*range(12), *range(-12, 0))]
     wanted = [[answer_words("", "", PlanStep.parse(target))[2:] for target in one] for one in targets.values()]
     assert len({str(one) for one in told}) == len(wanted) == 4
     assert all(one in wanted for one in told)
@@ -61,9 +61,9 @@ def test_the_teacher_answers_logs_as_it_did_in_the_simulator(logs: Path, monkeyp
 
 
 def test_some_logs_are_held_out(logs: Path) -> None:
-    source = Lessons(logs=logs)
-    mine, others = ({source.logged(seed).prefix[1:4] for seed in seeds} for seeds in (range(40), range(-40, 0)))
-    assert source.logged(3) == source.logged(3)
+    episode = Lessons().logged(logs)
+    mine, others = ({episode(seed).prefix[1:4] for seed in seeds} for seeds in (range(40), range(-40, 0)))
+    assert episode(3) == episode(3)
     assert others
     assert not mine & others
 

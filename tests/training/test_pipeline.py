@@ -71,7 +71,8 @@ def collect(request: RolloutRequest) -> None:
 def correct(request: DaggerRequest, workers: int) -> None:
     """Scripted corrections in place of the simulator: a student that is right on every second of its steps."""
     assert workers > 0
-    source = ShardReader(request.folder.parent / request.kind, request.kind)
+    kind = "demos" if request.kind == "lessons" else request.kind
+    source = ShardReader(request.folder.parent / kind, kind)
     rows = []
     for number in range(12):
         row = dict(source[number])
@@ -81,7 +82,7 @@ def correct(request: DaggerRequest, workers: int) -> None:
         executed = row["target"] if number % 2 else "MoveAhead(0.5)"
         note = {"executed": executed, "origin": "student" if number < 8 else "expert"}
         rows.append({**row, "episode": f"corrected{number // 3}", "privileged": json.dumps(note)})
-    writer = ShardWriter(request.folder, request.kind, request.config_hash, overwrite=True)
+    writer = ShardWriter(request.folder, kind, request.config_hash, overwrite=True)
     writer.write(0, rows)
     writer.finish({})
 
@@ -95,8 +96,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
     small = dataclasses.replace(cfg, model=_small(cfg.model))
     (root / "tiny").mkdir()
     shutil.copytree(shards, root / "tiny" / "data")
-    lessons = shutil.copytree(shards / "demos", root / "tiny" / "data" / "lessons")
-    pipeline = Pipeline(STAGES, small, collect, "python train.py stage=all", correct, Lessons(logs=lessons))
+    shutil.copytree(shards / "demos", root / "tiny" / "data" / "lessons")
+    pipeline = Pipeline(STAGES, small, collect, "python train.py stage=all", correct, Lessons())
     for stage in STAGES:
         assert pipeline.run(stage) is not None
     return pipeline
@@ -308,7 +309,8 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
     assert list(about["stages"]) == ["base", "dagger", "pointmap", "tokenizer", "alignment", "selu"]
     assert all(stage["command"] == "python train.py stage=all" and stage["metrics"] for stage in about["stages"].values())
-    assert set(about["shards"]) == {"clips", "views", "text_planning", "goal_questions", "demos", "dagger", "dagger_in_text"}
+    kinds = ("clips", "views", "text_planning", "goal_questions", "demos", "dagger", "dagger_in_text", "lessons", "practice")
+    assert set(about["shards"]) == set(kinds)
     ours, released = load_model(trained.paths.model("selu")), load_model(tmp_path / "tiny" / "full")
     theirs = dict(released.named_parameters())
     assert all(tensor.dtype == torch.float32 for tensor in theirs.values())
@@ -393,5 +395,5 @@ def test_a_stage_of_ones_own_is_one_class_and_one_entry(trained: Pipeline, tmp_p
     assert metrics is not None and metrics["rows"] > 0
     assert pipeline.run("counting") is None
     assert pipeline.run("base") is None
-    with pytest.raises(ValueError, match=r"stage 'sleep' has no key; allowed: words, base, .*, counting"):
+    with pytest.raises(ValueError, match=r"stage 'sleep' has no key; allowed: words, practice, .*, counting"):
         pipeline.key("sleep")

@@ -13,6 +13,7 @@ from proprio_mllm.training.stages.alignment import AlignmentStage
 from proprio_mllm.training.stages.base import BaseStage
 from proprio_mllm.training.stages.dagger import DaggerStage
 from proprio_mllm.training.stages.pointmap import PointMapStage
+from proprio_mllm.training.stages.practice import PracticeStage
 from proprio_mllm.training.stages.selu import SeluStage
 from proprio_mllm.training.stages.tokenizer import TokenizerStage
 from proprio_mllm.training.stages.words import WordsStage
@@ -21,6 +22,7 @@ __all__ = ["STAGES"]
 
 STAGES: Final[Mapping[str, Stage]] = {
     "words": WordsStage(),
+    "practice": PracticeStage(),
     "base": BaseStage(),
     "dagger": DaggerStage(),
     "pointmap": PointMapStage(),

@@ -11,7 +11,7 @@ from proprio_mllm.model.building import build_model, build_processor, save_model
 from proprio_mllm.model.word_tokens import add_word_tokens
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError, base_model_config
-from proprio_mllm.training.words import WordsObjective, held_out
+from proprio_mllm.training.words import WordsObjective, held_out_metrics
 
 __all__ = ["WordsStage"]
 
@@ -41,12 +41,12 @@ class WordsStage:
         model = build_model(cfg, processor, pipeline.cfg.seed)
         model.requires_grad_(False)
         model.core.model.language_model.requires_grad_(True)
+        logged = lessons.logged(pipeline.paths.shards("lessons"))
 
         def episode(seed: int) -> WordEpisode:
-            return lessons.logged(seed) if seed % 1000 < 1000 * share else lessons.episode(seed)
+            return logged(seed) if seed % 1000 < 1000 * share else lessons.episode(seed)
 
         objective = WordsObjective(model, episode, key, pipeline.cfg.words.reading)
         pipeline.loop(objective, pipeline.cfg.words.loop, folder / "loop")
         save_model(model.eval(), pipeline.paths.model("words"))
-        measured = held_out(model, lessons.episode)
-        return measured | {f"{name}_logged": value for name, value in held_out(model, lessons.logged).items()}
+        return held_out_metrics(model, {"": lessons.episode, "_logged": logged})

@@ -1,0 +1,77 @@
+"""Stage `practice`: DAgger in the simulator. The words model acts, its teacher answers, and it learns from both worlds."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data.shards import ShardReader, config_hash
+from proprio_mllm.model.building import load_model, save_model
+from proprio_mllm.model.wording import WordEpisode
+from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError
+from proprio_mllm.training.rollouts import DaggerRequest
+from proprio_mllm.training.words import WordsObjective, held_out_metrics
+
+__all__ = ["PracticeStage"]
+
+
+class PracticeStage:
+    """One loop over episodes of the text world, of the teacher in the simulator, and of the model itself there."""
+
+    name = "practice"
+    needs = ("words",)
+    shards = ("lessons",)
+    recipe = 0
+
+    def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
+        """The loop, and how much the model acts."""
+        return {"practice": dataclasses.asdict(pipeline.cfg.practice)}
+
+    def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
+        """Lets the model act, trains it and stores it; measures it on episodes that it was not trained on."""
+        lessons, cfg, student = pipeline.lessons, pipeline.cfg.practice, pipeline.paths.model("words")
+        if lessons is None or pipeline.collect_dagger is None:
+            raise StageError("stage 'practice' needs lessons and the simulator: run it with `python train.py stage=practice`")
+        shards = pipeline.paths.shards("practice")
+        if pipeline.cfg.overwrite:
+            shutil.rmtree(shards, ignore_errors=True)
+        written = config_hash({"key": pipeline.key("words"), "episodes": cfg.episodes, "share": cfg.teacher_share})
+        request = DaggerRequest(
+            student,
+            shards,
+            "lessons",
+            cfg.episodes,
+            pipeline.cfg.seed,
+            cfg.teacher_share,
+            pipeline.cfg.model.image_size,
+            written,
+        )
+        pipeline.collect_dagger(request, workers=cfg.workers)
+        taught, own = lessons.logged(pipeline.paths.shards("lessons")), lessons.logged(shards)
+
+        def episode(seed: int) -> WordEpisode:
+            draw = seed % 1000 / 1000
+            if draw < cfg.own_share:
+                return own(seed)
+            return taught(seed) if draw < cfg.own_share + cfg.logged else lessons.episode(seed)
+
+        model = load_model(student)
+        model.requires_grad_(False)
+        model.core.model.language_model.requires_grad_(True)
+        pipeline.loop(WordsObjective(model, episode, key, pipeline.cfg.words.reading), cfg.loop, folder / "loop")
+        save_model(model.eval(), pipeline.paths.model("practice"))
+        reader = ShardReader(shards, "demos")
+        notes = [json.loads(text) for text in reader.column("privileged")]
+        acted = [note["executed"] == target for note, target in zip(notes, reader.column("target"), strict=True)]
+        mine = [same for note, same in zip(notes, acted, strict=True) if note["origin"] == "student"]
+        return {
+            **held_out_metrics(model, {"": lessons.episode, "_logged": taught, "_own": own}),
+            "own_steps": float(len(mine)),
+            "own_as_teacher": float(np.mean(mine)) if mine else 0.0,
+        }
