@@ -85,16 +85,21 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
 
     from proprio_mllm.evaluation.lessons import Lessons
     from proprio_mllm.training.pipeline import Pipeline, StageError
-    from proprio_mllm.training.stages import STAGES
+    from proprio_mllm.training.stages import stages_of
 
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
     command = " ".join(["python train.py", *sys.argv[1:]])
     robots = cfg.data.robots
+    stages = stages_of(cfg.model)
     pipeline = Pipeline(
-        STAGES, cfg, partial(_rollouts, robots=robots), command, partial(_dagger, robots=robots), Lessons(robots)
+        stages, cfg, partial(_rollouts, robots=robots), command, partial(_dagger, robots=robots), Lessons(robots)
     )
-    wanted = tuple(name for name in STAGES if name not in ("words", "practice")) if cfg.stage == "all" else (cfg.stage,)
+    wanted = (
+        tuple(name for name in stages if cfg.model.episodes or name not in ("words", "practice"))
+        if cfg.stage == "all"
+        else (cfg.stage,)
+    )
     metrics = {name: pipeline.run(name) for name in wanted}
     if cfg.release is not None:
         from proprio_mllm.training.release import export

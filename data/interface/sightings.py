@@ -6,12 +6,13 @@ Folded observation by observation, so that planners, and the sequences that mode
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from data.interface.belief import Belief
 from data.interface.observation import HistoryItem
 
-__all__ = ["Seen", "Sightings"]
+__all__ = ["Seen", "Shown", "Sightings"]
 
 
 class Seen(Protocol):
@@ -27,6 +28,17 @@ class Seen(Protocol):
     def known_objects(self) -> tuple[str, ...]: ...
     @property
     def history(self) -> tuple[HistoryItem, ...]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """The words of an observation without the rest of it."""
+
+    instruction: str
+    robot: str
+    visible_objects: tuple[str, ...]
+    known_objects: tuple[str, ...]
+    history: tuple[HistoryItem, ...] = ()
 
 
 class Sightings:

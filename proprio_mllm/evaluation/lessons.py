@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Callable, Mapping, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -24,7 +24,7 @@ from data.interface.actions import ACTIONS
 from data.interface.bodies import PAPER_ROBOTS
 from data.interface.failures import FAILURES
 from data.interface.observation import HistoryItem
-from data.interface.sightings import Sightings
+from data.interface.sightings import Shown, Sightings
 from data.interface.steps import Action, PlanStep
 from data.shards import ShardReader
 from proprio_mllm.model.wording import (
@@ -49,7 +49,7 @@ from sim.scene.catalogue import load_catalogue
 from sim.tasks.instructions import ORDINALS, TEMPLATES, natural_name, plural
 from sim.tasks.sample import TRAIN_ROOMS, rng_for
 
-__all__ = ["Lessons", "Shown", "WordsOnly"]
+__all__ = ["Lessons", "WordsOnly"]
 
 #: Shares of steps that are mistakes, one drawn per episode.
 _MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
@@ -59,17 +59,6 @@ _MOST_RENAMED: Final = 5
 _SYLLABLES: Final = ("ba", "do", "fi", "gu", "ka", "lo", "mi", "nu", "pe", "ra", "so", "tu", "va", "wo", "xi", "zu")
 #: Numbers of instructions; counts of things.
 _COUNTS: Final = ("two", "three", "four")
-
-
-@dataclass(frozen=True, slots=True)
-class Shown:
-    """The words of an observation (`data.interface.sightings.Seen`)."""
-
-    instruction: str
-    robot: str
-    visible_objects: tuple[str, ...]
-    known_objects: tuple[str, ...]
-    history: tuple[HistoryItem, ...] = ()
 
 
 class WordsOnly:
@@ -164,20 +153,26 @@ class Lessons:
         Raises:
             data.shards.ShardError: when they cannot be read.
         """
-        logs = _Logs(folder)
+        logs = _logs(folder)
+        apart = {name for name in logs if held_out(name)} or set(list(logs)[:1])
+        train, test = ([log for name, log in logs.items() if (name in apart) is wanted] for wanted in (False, True))
 
         def episode(seed: int) -> WordEpisode:
-            rng = rng_for("lesson of a log", seed)
-            some = logs.held_out if seed < 0 else logs.train
-            return _of_log(*some[int(rng.integers(len(some)))], rng)
+            rng, some = rng_for("lesson of a log", seed), test if seed < 0 else train
+            looks, done = some[int(rng.integers(len(some)))]
+            known = looks[-1].known_objects
+            return _of_log(looks, done, _new_names(known, set(known) - set(looks[0].known_objects), rng))
 
         return episode
 
+    def told(self, folder: Path) -> tuple[WordEpisode, ...]:
+        """All episodes of a folder as `logged` gives them, in order and with their own names; a turn is a row."""
+        return tuple(_of_log(looks, done, {}) for looks, done in _logs(folder).values())
 
-def _of_log(looks: Sequence[Shown], done: bool, rng: np.random.Generator) -> WordEpisode:
-    """The episode in which a planner was shown this, and whose goals were met at its end or not."""
-    known = looks[-1].known_objects
-    teacher, record = ScriptedPlanner(), _Record(_new_names(known, set(known) - set(looks[0].known_objects), rng))
+
+def _of_log(looks: Sequence[Shown], done: bool, names: Mapping[str, str]) -> WordEpisode:
+    """The episode in which a planner was shown this, and whose goals were met at its end or not, under other names."""
+    teacher, record = ScriptedPlanner(), _Record(names)
     for number, shown in enumerate(looks, 1):
         step, job = teacher.decide(shown)
         if done and number == len(looks):
@@ -189,26 +184,17 @@ def _of_log(looks: Sequence[Shown], done: bool, rng: np.random.Generator) -> Wor
     return record.episode()
 
 
-class _Logs:
-    """Episodes of the simulator in words: what was shown before every step, and whether the goals were met at the end.
-
-    Attributes:
-        train: episodes to learn from.
-        held_out: one in twenty, one at least.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        reader = ShardReader(folder, "demos")
-        columns = [reader.column(name) for name in ("episode", "instruction", "robot", "visible", "known", "history", "target")]
-        episodes: dict[str, list[Shown]] = {}
-        done: dict[str, bool] = {}
-        for episode, instruction, robot, visible, known, history, target in zip(*columns, strict=True):
-            items = tuple(HistoryItem(**item) for item in history)
-            episodes.setdefault(episode, []).append(Shown(instruction, robot, tuple(visible), tuple(known), items))
-            done[episode] = target == "Done()"
-        kept_back = {name for name in episodes if held_out(name)} or set(list(episodes)[:1])
-        self.train = [(looks, done[name]) for name, looks in episodes.items() if name not in kept_back]
-        self.held_out = [(looks, done[name]) for name, looks in episodes.items() if name in kept_back]
+def _logs(folder: Path) -> dict[str, tuple[list[Shown], bool]]:
+    """Episodes of the simulator by name: what was shown before every step, and whether the goals were met at the end."""
+    reader = ShardReader(folder, "demos")
+    columns = [reader.column(name) for name in ("episode", "instruction", "robot", "visible", "known", "history", "target")]
+    episodes: dict[str, list[Shown]] = {}
+    done: dict[str, bool] = {}
+    for episode, instruction, robot, visible, known, history, target in zip(*columns, strict=True):
+        items = tuple(HistoryItem(**item) for item in history)
+        episodes.setdefault(episode, []).append(Shown(instruction, robot, tuple(visible), tuple(known), items))
+        done[episode] = target == "Done()"
+    return {name: (looks, done[name]) for name, looks in episodes.items()}
 
 
 class _Record:

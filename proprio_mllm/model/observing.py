@@ -17,7 +17,7 @@ from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import plan_prompt, with_answer
 from proprio_mllm.model.vocabulary import motion_text
 
-__all__ = ["motion_codes", "plan_example", "turn_example", "view_of"]
+__all__ = ["motion_codes", "pictured_turn", "plan_example", "turn_example", "view_of"]
 
 
 def view_of(observation: Observation) -> View:
@@ -87,13 +87,27 @@ def turn_example(
         answer: tokens of the answer, or its beginning; learnt in training.
         read: tokens of the log to leave out because they have been read.
     """
-    tokens, views = [*log, *now], ()
-    if model.cfg.sees:
-        assert observation is not None
-        codes = motion_codes(observation, model.cfg, motion)
+    if not model.cfg.sees:
+        return pictured_turn(model, log, now, None, None, answer, read)
+    assert observation is not None
+    return pictured_turn(model, log, now, view_of(observation), motion_codes(observation, model.cfg, motion), answer, read)
+
+
+def pictured_turn(
+    model: ProprioMLLM,
+    log: Sequence[int],
+    now: Sequence[int],
+    view: View | None,
+    codes: Sequence[int] | None,
+    answer: Sequence[int] = (),
+    read: int = 0,
+) -> Example:
+    """`turn_example` with its parts at hand: the view, None for none, and the motion tokens, None for none."""
+    tokens = [*log, *now]
+    if view is not None:
         text = IMAGE + (motion_text(codes) if codes is not None else "")
         sight = model.processor.tokenizer(text, add_special_tokens=False)["input_ids"]
-        tokens, views = [*log, *now[:-1], *sight, now[-1]], (view_of(observation),)
+        tokens = [*log, *now[:-1], *sight, now[-1]]
     learnt = [False] * len(tokens) + [True] * len(answer)
     encoded = Encoded(tuple([*tokens, *answer][read:]), tuple(learnt[read:]))
-    return Example(views=views, tokens=encoded, start=read)
+    return Example(views=() if view is None else (view,), tokens=encoded, start=read)

@@ -35,11 +35,15 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, body_state_prompt, described_motion, filled_motion, looking, made_motion
 from proprio_mllm.training.asking import answer_shares
+from proprio_mllm.training.base import EPISODE_ROWS
 from proprio_mllm.training.goal_questions import judge_example
+from proprio_mllm.training.loop import Parts
 from proprio_mllm.training.phrases import body_state_words
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, GoalQuestions, TextPlanning, Views
+from proprio_mllm.training.turns import Turns
+from proprio_mllm.training.words import WordBatch, WordsObjective
 
-__all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Phase", "body_state", "body_state_accuracy"]
+__all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Episodes", "Phase", "body_state", "body_state_accuracy"]
 
 Kind = Literal["say", "feel", "do", "fill", "say_image", "body", "plan", "text"]
 
@@ -61,6 +65,14 @@ PHASES: Final[Mapping[str, Phase]] = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class Episodes:
+    """Where whole episodes are read: decisions with pictures, and episodes in words."""
+
+    turns: Turns
+    words: WordsObjective
+
+
 class AlignmentData:
     """Examples of every kind, with motion tokens computed once."""
 
@@ -71,12 +83,14 @@ class AlignmentData:
         clips: Clips,
         views: Views,
         demos: Demos,
-        text_planning: TextPlanning,
-        goal_questions: GoalQuestions,
+        text_planning: TextPlanning | None,
+        goal_questions: GoalQuestions | None,
         cfg: AlignmentConfig,
+        episodes: Episodes | None = None,
     ) -> None:
+        assert (text_planning is None) == (goal_questions is None) == (episodes is not None)
         self.tokenizer, self.clips, self.views, self.demos = tokenizer, clips, views, demos
-        self.text_planning, self.goal_questions = text_planning, goal_questions
+        self.text_planning, self.goal_questions, self.episodes = text_planning, goal_questions, episodes
         self._cfg, self._collator = cfg, Collator(model.processor, model.cfg)
         self._style: Style = model.cfg.prompt
         self._proprioception = model.cfg.proprioception
@@ -90,12 +104,16 @@ class AlignmentData:
     def _encode(self, windows: NDArray[np.float32]) -> list[list[int]]:
         return self.tokenizer.encode(torch.from_numpy(windows).to(self.tokenizer.mean.device)).tolist()
 
-    def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> tuple[Batch, ...]:
+    def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> tuple[Batch, ...] | Parts:
         """A batch of one kind from the training rows, in parts."""
+        if kind == "text" and self.episodes is not None:
+            return self.episodes.words.batch(rng, max(1, size // EPISODE_ROWS))
         return self._collator.in_parts(self._examples(kind, rng, size))
 
     def _examples(self, kind: Kind, rng: np.random.Generator, size: int) -> list[Example]:
         if kind == "text":
+            assert self.text_planning is not None
+            assert self.goal_questions is not None
             judged = rng.random(size) < self._cfg.judge_share
             return [self.goal_questions.draw(rng) if one else self.text_planning.draw(rng, self.bodies) for one in judged]
         if kind == "plan":
@@ -114,6 +132,8 @@ class AlignmentData:
     def _plan(self, index: int, rng: np.random.Generator) -> Example:
         if rng.random() < self._cfg.judge_share:
             return judge_example(self.demos, index, rng, self._demo_tokens)
+        if self.episodes is not None:
+            return self.episodes.turns.draw(rng, 1)[0]
         return self.demos.example(index, None if self._demo_tokens is None else self._demo_tokens[index].tolist())
 
     def _motion_text(self, kind: Kind, clip: int, codes: Sequence[int], rng: np.random.Generator) -> Example:
@@ -184,20 +204,23 @@ class AlignmentObjective:
         self._data, self._cfg = data, cfg
         self._kinds: tuple[Kind, ...] = kinds if model.cfg.proprioception else ("body", "plan")
 
-    def batch(self, rng: np.random.Generator, size: int) -> tuple[Kind, tuple[Batch, ...]]:
+    def batch(self, rng: np.random.Generator, size: int) -> tuple[Kind, tuple[Batch, ...]] | Parts:
         """A batch of one kind, drawn anew each step."""
         others: tuple[Kind, ...] = tuple(kind for kind in self._kinds if kind != "plan")
         if "plan" in self._kinds and rng.random() < self._cfg.plan_share:
             kind: Kind = "text" if rng.random() < self._cfg.text_share else "plan"
         else:
             kind = others[int(rng.integers(len(others)))]
-        return kind, self._data.batch(kind, rng, size)
+        made = self._data.batch(kind, rng, size)
+        return made if isinstance(made, Parts) else (kind, made)
 
     def loss(
-        self, module: nn.Module, batch: tuple[Kind, tuple[Batch, ...]], generator: torch.Generator
+        self, module: nn.Module, batch: tuple[Kind, tuple[Batch, ...]] | WordBatch, generator: torch.Generator
     ) -> tuple[Tensor, Mapping[str, float]]:
         """Cross-entropy over the answers; nothing is drawn."""
-        del generator
+        if isinstance(batch, WordBatch):
+            assert self._data.episodes is not None
+            return self._data.episodes.words.loss(module, batch, generator)
         kind, inputs = batch
         out = module(inputs)
         return out.loss, {f"{kind}_loss": float(out.loss.detach()), f"{kind}_accuracy": out.correct / max(out.supervised, 1)}

@@ -24,11 +24,16 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
 from proprio_mllm.training.asking import LONGEST_STEP, answer_shares, replies
 from proprio_mllm.training.goal_questions import judge_example
+from proprio_mllm.training.loop import Parts
 from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, TextPlanning, Views
+from proprio_mllm.training.turns import Turns
+from proprio_mllm.training.words import WordBatch, WordsObjective
 
-__all__ = ["DenseObjective", "JointObjective", "grounding_accuracy", "plan_accuracy", "text_accuracy"]
+__all__ = ["DenseObjective", "EpisodeObjective", "JointObjective", "grounding_accuracy", "plan_accuracy", "text_accuracy"]
 
+#: Decisions that take as long as an episode in words.
+EPISODE_ROWS: Final = 4
 #: Share of phrases among the exercises.
 PHRASES: Final = 0.1
 
@@ -64,7 +69,7 @@ class _WithDense(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class _JointBatch(Movable):
-    kind: Literal["dense", "look", "plan", "text"]
+    kind: Literal["dense", "look", "plan", "text", "judge"]
     text: Batch | tuple[Batch, ...] | None
     images: ImageBatch | None
     dense: DenseTargets | None
@@ -150,6 +155,61 @@ class JointObjective(_Base):
         if rng.random() < PHRASES:
             return phrase(self._clips, rng, self._demos.style)
         return self._text_planning.draw(rng)
+
+
+class EpisodeObjective(_Base):
+    """Mixed batches where whole episodes are read: decisions with pictures, episodes in words, and what `JointObjective` asks.
+
+    Args:
+        model: starts with the language model of stage `practice`.
+        head: dense head.
+        views: posed views.
+        turns: decisions with pictures.
+        demos: the rows that these come from, for judging questions.
+        clips: captions.
+        words: the objective of episodes in words.
+        cfg: shares.
+        key: of the checkpoint.
+    """
+
+    name = "base/joint"
+
+    def __init__(
+        self,
+        model: ProprioMLLM,
+        head: DenseHead,
+        views: Views,
+        turns: Turns,
+        demos: Demos,
+        clips: Clips,
+        words: WordsObjective,
+        cfg: BaseConfig,
+        key: str,
+    ) -> None:
+        super().__init__(model, head, views, cfg, key)
+        self._turns, self._demos, self._clips, self._words = turns, demos, clips, words
+
+    def batch(self, rng: np.random.Generator, size: int) -> _JointBatch | Parts:
+        """A batch of views, of judging questions and phrases, of episodes in words, or of decisions."""
+        if rng.random() >= self._cfg.plan_share:
+            return self._view_batch(rng, size, self._cfg.questions)
+        if rng.random() < self._cfg.text_share:
+            return self._words.batch(rng, max(1, size // EPISODE_ROWS))
+        if rng.random() >= self._cfg.judge_share:
+            return _JointBatch("plan", self._collator.in_parts(self._turns.draw(rng, size)), None, None, 0.0)
+        examples = [
+            phrase(self._clips, rng, self._demos.style) if rng.random() < PHRASES else judge_example(self._demos, i, rng, None)
+            for i in self._demos.draw(rng, size)
+        ]
+        return _JointBatch("judge", self._collator.in_parts(examples), None, None, 0.0)
+
+    def loss(
+        self, module: nn.Module, batch: _JointBatch | WordBatch, generator: torch.Generator
+    ) -> tuple[Tensor, Mapping[str, float]]:
+        """Loss of one batch, or of one part of episodes in words; nothing is drawn."""
+        if isinstance(batch, WordBatch):
+            return self._words.loss(self.module.model, batch, generator)
+        return super().loss(module, batch, generator)
 
 
 @torch.no_grad()

@@ -44,7 +44,7 @@ def judge_example(demos: Demos, index: int, rng: np.random.Generator, tokens: ND
     row = demos.reader[int(index)]
     motion = None if tokens is None else tokens[int(index)].tolist()
     history = history_of(row)
-    if ended:
+    if ended and row["target"] != "Done()":
         history.append(HistoryItem(row["target"], "; ".join(f"{part.strip()} ok" for part in row["target"].split("&"))))
     if rng.random() < 0.5:
         goal, done = row["instruction"], ended

@@ -57,6 +57,10 @@ class LessonSource(Protocol):
         """Episodes of the simulator, each drawn with a seed; those of negative seeds are held out."""
         ...
 
+    def told(self, folder: Path) -> tuple[WordEpisode, ...]:
+        """All episodes of a folder in order; a turn is a row."""
+        ...
+
 
 class Stage(Protocol):
     """One stage of training.

@@ -256,23 +256,25 @@ class Demos:
         folder: demonstrations.
         cfg: the model's.
         more: further folders of the same kind (corrections); their rows follow.
+        failures: whether there are episodes without success among them; those with it end in `Done`.
     """
 
-    def __init__(self, folder: Path, cfg: ModelConfig, more: Sequence[Path] = ()) -> None:
+    def __init__(self, folder: Path, cfg: ModelConfig, more: Sequence[Path] = (), failures: bool = False) -> None:
         self.reader = _Joined([folder, *more])
         self.split = _Split(self.reader.column("episode"), folder)
         self.motions = np.stack([decode_motion(m) for m in self.reader.column("motion")])  # (N, T, F)
         last: dict[str, tuple[int, int]] = {}
         for index, (episode, step) in enumerate(zip(self.reader.column("episode"), self.reader.column("step"), strict=True)):
             last[episode] = max(last.get(episode, (-1, -1)), (int(step), index))
-        #: Training rows of each episode's last step, after which the goals held: collectors keep successes only.
-        self.finals = np.intersect1d([index for _, index in last.values()], self.split.train)
+        targets = self.reader.column("target")
+        ends = [index for _, index in last.values() if not failures or targets[index] == "Done()"]
+        #: Training rows of the last step of each episode that met its goals.
+        self.finals = np.intersect1d(np.array(ends, dtype=np.int64), self.split.train)
         self.style: Style = cfg.prompt
         self._cfg, self._logs = cfg, self.reader.logs()
         labels = np.char.add(np.asarray(self.reader.column("category")), np.asarray(self.reader.folder_of(), dtype=str))
         labels = labels[self.split.train]
         self._groups = [self.split.train[labels == name] for name in sorted(set(labels))]
-        targets = self.reader.column("target")
         self._symbolic = np.array([i for i in self.split.train if is_symbolic(targets[int(i)])], dtype=np.int64)
 
     def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:

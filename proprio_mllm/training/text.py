@@ -17,29 +17,36 @@ from proprio_mllm.training.goals import type_words
 from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, TextPlanning, Views
 
-__all__ = ["corpus", "start_from_words", "whole_words"]
+__all__ = ["adopt", "corpus", "start_from_words", "whole_words"]
 
 
 def corpus(
-    cfg: ModelConfig, views: Views, demos: Demos, text_planning: TextPlanning, clips: Clips, seed: int = 0, limit: int = 4000
+    cfg: ModelConfig,
+    views: Views,
+    demos: Demos | None,
+    text_planning: TextPlanning | None,
+    clips: Clips,
+    seed: int = 0,
+    limit: int = 4000,
 ) -> list[str]:
     """Texts of every kind that the model will read or write.
 
     Args:
         cfg: prompt style.
         views: shards.
-        demos: shards.
-        text_planning: shards.
+        demos: shards; None where planning is told in words that are tokens already.
+        text_planning: shards; None likewise.
         clips: shards.
         seed: of the choice of rows.
         limit: rows per kind.
     """
     rng = np.random.default_rng(seed)
     texts = [caption for captions in clips.captions[:limit] for caption in captions]
-    for index in _some(demos.split.train, limit, rng):
+    for index in [] if demos is None else _some(demos.split.train, limit, rng):
+        assert demos is not None
         example = demos.example(int(index), None)
         texts.append(render(example.messages))
-    texts.extend(render(text_planning.draw(rng).messages) for _ in range(limit))
+    texts.extend(render(text_planning.draw(rng).messages) for _ in range(limit if text_planning else 0) if text_planning)
     texts.extend(render(phrase(clips, rng, cfg.prompt).messages) for _ in range(limit // 4))
     for index in _some(views.split.train, limit // 4, rng):
         row = views.row(int(index))
@@ -77,6 +84,29 @@ def start_from_words(model: ProprioMLLM, names: Sequence[str]) -> None:
             raise ValueError(f"type {name!r} is {len(own)} tokens; it must be one")
         words = tokenizer(f" {type_words(name)}", add_special_tokens=False).input_ids
         rows[own[0]] = rows[words].sum(0) / len(words) ** 0.5
+
+
+@torch.no_grad()
+def adopt(model: ProprioMLLM, source: ProprioMLLM) -> None:
+    """Takes over a language model: its layers, and its rows for every token that both tokenizers have.
+
+    Raises:
+        ValueError: when the two are of different shapes.
+    """
+    own, theirs = model.core.model.language_model.state_dict(), source.core.model.language_model.state_dict()
+    for name, tensor in theirs.items():
+        if name == "embed_tokens.weight":
+            continue
+        if name not in own or own[name].shape != tensor.shape:
+            raise ValueError(f"{name} is {tuple(tensor.shape)} in the language model that is to be taken over, and not so here")
+        own[name].copy_(tensor)
+    mine, other = model.processor.tokenizer.get_vocab(), source.processor.tokenizer.get_vocab()
+    shared = [(mine[text], other[text]) for text in mine.keys() & other.keys()]
+    to, at = (torch.tensor(column) for column in zip(*shared, strict=True))
+    pairs: list[tuple[Any, Any]] = [(model.core.get_input_embeddings(), source.core.get_input_embeddings())]
+    pairs += [(model.core.lm_head, source.core.lm_head)]  # the same where they are tied
+    for rows, given in pairs:
+        rows.weight[to] = given.weight[at]
 
 
 def _some(indices: np.ndarray, limit: int, rng: np.random.Generator) -> np.ndarray:

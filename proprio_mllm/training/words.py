@@ -24,8 +24,10 @@ from proprio_mllm.model.word_tokens import WordTokens, first_word
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.loop import Parts
 
-__all__ = ["WordBatch", "WordsObjective", "collate", "held_out_metrics", "rows_of", "words_loss"]
+__all__ = ["Source", "WordBatch", "WordsObjective", "collate", "held_out_metrics", "mixed", "rows_of", "words_loss"]
 
+#: The episode of a seed.
+Source = Callable[[int], WordEpisode]
 #: Decisions of a row, and rows that are computed together.
 _TURNS: Final = 6
 _ROWS: Final = 8
@@ -162,6 +164,20 @@ def _width(batch: WordBatch) -> int:
     return (batch.input_ids.shape[1] - batch.layout.log) // batch.layout.anchors.shape[1]
 
 
+def mixed(rest: Source, *others: tuple[float, Source]) -> Source:
+    """Episodes of several sources, each of some with a share, the rest of one."""
+
+    def episode(seed: int) -> WordEpisode:
+        draw = seed % 1000 / 1000
+        for share, source in others:
+            if draw < share:
+                return source(seed)
+            draw -= share
+        return rest(seed)
+
+    return episode
+
+
 class WordsObjective:
     """Episodes drawn anew in every batch.
 
@@ -174,7 +190,7 @@ class WordsObjective:
 
     name = "words"
 
-    def __init__(self, model: ProprioMLLM, episode: Callable[[int], WordEpisode], key: str, reading: float = 0.0) -> None:
+    def __init__(self, model: ProprioMLLM, episode: Source, key: str, reading: float = 0.0) -> None:
         self.model, self._episode, self.key, self._reading = model, episode, key, reading
         self._pad = int(model.processor.tokenizer.pad_token_id)
 
@@ -226,9 +242,7 @@ def _learnt(batch: WordBatch) -> Tensor:
 
 
 @torch.no_grad()
-def held_out_metrics(
-    model: ProprioMLLM, sources: Mapping[str, Callable[[int], WordEpisode]], count: int = 64
-) -> dict[str, float]:
+def held_out_metrics(model: ProprioMLLM, sources: Mapping[str, Source], count: int = 64) -> dict[str, float]:
     """Loss and exactness on episodes whose seeds training does not draw: negative ones.
 
     Args:

@@ -13,13 +13,14 @@ from proprio_mllm.model.building import add_adapter, build_model, build_point_ma
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, body_state_accuracy
+from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, Episodes, body_state_accuracy
 from proprio_mllm.training.base import grounding_accuracy, plan_accuracy, text_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded, variant_model
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, GoalQuestions, Views
-from proprio_mllm.training.stages.inputs import demonstrations, text_rows
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, GoalQuestions, Views
+from proprio_mllm.training.stages.inputs import demonstrations, episodes_in_words, lessons_of, text_rows, turns_of
+from proprio_mllm.training.turns import turn_accuracy
 
-__all__ = ["AlignmentStage", "start"]
+__all__ = ["AlignmentStage", "EpisodeAlignmentStage", "start"]
 
 
 class AlignmentStage:
@@ -40,11 +41,9 @@ class AlignmentStage:
         """Trains and stores the variant's model, and measures grounding, body state and planning."""
         model = start(pipeline)
         tokenizer = MotionTokenizer.load(pipeline.paths.model("tokenizer"))
-        views, demos = Views(pipeline.paths.shards("views"), model.cfg), demonstrations(pipeline, model.cfg)
-        text_planning = text_rows(pipeline, model.cfg, demos)
-        goal_questions = GoalQuestions(pipeline.paths.shards("goal_questions"), model.cfg)
-        clips = Clips(pipeline.paths.shards("clips"))
-        data = AlignmentData(model, tokenizer, clips, views, demos, text_planning, goal_questions, pipeline.cfg.alignment)
+        views, clips = Views(pipeline.paths.shards("views"), model.cfg), Clips(pipeline.paths.shards("clips"))
+        demos = self.demos(pipeline, model)
+        data = self.data(pipeline, model, tokenizer, clips, views, demos, key)
         # without proprioception there is nothing to align apart
         wanted = PHASES if model.cfg.proprioception else ("joint",)
         loops = {phase: getattr(pipeline.cfg.alignment, phase) for phase in wanted}
@@ -57,12 +56,72 @@ class AlignmentStage:
         save_model(model.eval(), pipeline.paths.model("alignment"), read)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
         felt = body_state_accuracy(model, demos, read) if read is not None else {}
-        return {**asked, **felt, **plan_accuracy(model, demos, read), **text_accuracy(model, text_planning, data.bodies)}
+        return {**asked, **felt, **self.planning(model, data, demos, read)}
+
+    def demos(self, pipeline: Pipeline, model: ProprioMLLM) -> Demos:
+        """Steps with pictures and motion."""
+        return demonstrations(pipeline, model.cfg)
+
+    def data(
+        self,
+        pipeline: Pipeline,
+        model: ProprioMLLM,
+        tokenizer: MotionTokenizer,
+        clips: Clips,
+        views: Views,
+        demos: Demos,
+        key: str,
+    ) -> AlignmentData:
+        """What the phases draw from."""
+        del key
+        text_planning = text_rows(pipeline, model.cfg, demos)
+        questions = GoalQuestions(pipeline.paths.shards("goal_questions"), model.cfg)
+        return AlignmentData(model, tokenizer, clips, views, demos, text_planning, questions, pipeline.cfg.alignment)
+
+    def planning(self, model: ProprioMLLM, data: AlignmentData, demos: Demos, read: MotionTokenizer | None) -> Metrics:
+        """How often a held-out step is the teacher's."""
+        assert data.text_planning is not None
+        return {**plan_accuracy(model, demos, read), **text_accuracy(model, data.text_planning, data.bodies)}
+
+
+class EpisodeAlignmentStage(AlignmentStage):
+    """The same where whole episodes are read."""
+
+    needs = ("base", "practice", "pointmap", "tokenizer")
+    shards = ("lessons",)
+    recipe = 0
+
+    def demos(self, pipeline: Pipeline, model: ProprioMLLM) -> Demos:
+        """Rows of lessons."""
+        return lessons_of(pipeline, model.cfg)
+
+    def data(
+        self,
+        pipeline: Pipeline,
+        model: ProprioMLLM,
+        tokenizer: MotionTokenizer,
+        clips: Clips,
+        views: Views,
+        demos: Demos,
+        key: str,
+    ) -> AlignmentData:
+        """What the phases draw from."""
+        turns = turns_of(pipeline, model, demos, tokenizer if model.cfg.proprioception else None)
+        episodes = Episodes(turns, episodes_in_words(pipeline, model, f"{key}/words"))
+        return AlignmentData(model, tokenizer, clips, views, demos, None, None, pipeline.cfg.alignment, episodes)
+
+    def planning(self, model: ProprioMLLM, data: AlignmentData, demos: Demos, read: MotionTokenizer | None) -> Metrics:
+        """How often a held-out answer is the teacher's."""
+        del demos, read
+        assert data.episodes is not None
+        return turn_accuracy(model, data.episodes.turns)
 
 
 def start(pipeline: Pipeline) -> ProprioMLLM:
     """The base model with this variant's MPE and CSE and the trained point map."""
     cfg = variant_model(pipeline.cfg.model, pipeline.cfg.variant)
+    if cfg.episodes:
+        cfg = dataclasses.replace(cfg, sees=True)
     point_map = None
     if cfg.cse.enabled:
         point_map = seeded(lambda: build_point_map(cfg), pipeline.cfg.seed)

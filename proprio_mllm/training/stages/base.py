@@ -8,15 +8,27 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from proprio_mllm.model.building import build_model, build_processor, save_model
+from proprio_mllm.model.building import build_model, build_processor, load_model, save_model
 from proprio_mllm.model.dense import DenseHead
 from proprio_mllm.model.groups import train_only
-from proprio_mllm.training.base import DenseObjective, JointObjective, grounding_accuracy, plan_accuracy, text_accuracy
-from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config, seeded
+from proprio_mllm.model.word_tokens import add_word_tokens
+from proprio_mllm.model.wording import id_words
+from proprio_mllm.training.base import (
+    DenseObjective,
+    EpisodeObjective,
+    JointObjective,
+    grounding_accuracy,
+    plan_accuracy,
+    text_accuracy,
+)
+from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError, base_model_config, seeded
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, TextPlanning, Views
-from proprio_mllm.training.text import corpus, start_from_words, whole_words
+from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
+from proprio_mllm.training.text import adopt, corpus, start_from_words, whole_words
+from proprio_mllm.training.turns import turn_accuracy
+from proprio_mllm.training.words import held_out_metrics
 
-__all__ = ["BaseStage"]
+__all__ = ["BaseStage", "EpisodeBaseStage"]
 
 logger = logging.getLogger(__name__)
 
@@ -60,3 +72,39 @@ class BaseStage:
         save_model(model.eval(), pipeline.paths.model("base"))
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE))
         return {**asked, **plan_accuracy(model, demos), **text_accuracy(model, text_planning)}
+
+
+class EpisodeBaseStage(BaseStage):
+    """The same where whole episodes are read: the language model is that of `practice`, and learns to see."""
+
+    needs = ("practice",)
+    shards = ("views", "lessons", "clips")
+    recipe = 0
+
+    def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
+        """Trains and stores the base model."""
+        cfg, lessons = pipeline.cfg, pipeline.lessons
+        if lessons is None:
+            raise StageError("stage 'base' needs lessons: run it with `python train.py stage=base`")
+        plain = dataclasses.replace(base_model_config(cfg.model), episodes=True, sees=True)
+        views, clips = Views(pipeline.paths.shards("views"), plain), Clips(pipeline.paths.shards("clips"))
+        demos = lessons_of(pipeline, plain)
+        processor = build_processor(plain, corpus(plain, views, None, None, clips, cfg.seed), whole_words(views))
+        add_word_tokens(processor.tokenizer, lessons.words())
+        model = build_model(plain, processor, cfg.seed)
+        adopt(model, load_model(pipeline.paths.model("practice")))
+        start_from_words(model, views.type_names)
+        names = [f" {' '.join(id_words(f'{name}_1')[:-1])}" for name in views.type_names]
+        head = seeded(lambda: DenseHead(model, names), cfg.seed)
+        dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
+        chosen = {id(p) for p in train_only(model, ("vision", "merger"))} | {id(p) for p in head.parameters()}
+        for parameter in dense.module.parameters():
+            parameter.requires_grad_(id(parameter) in chosen)
+        pipeline.loop(dense, cfg.base.dense, folder / "dense")
+        model.requires_grad_(True)
+        turns, words = turns_of(pipeline, model, demos), episodes_in_words(pipeline, model, f"{key}/words")
+        joint = EpisodeObjective(model, head, views, turns, demos, clips, words, cfg.base, f"{key}/joint")
+        pipeline.loop(joint, cfg.base.joint, folder / "joint")
+        save_model(model.eval(), pipeline.paths.model("base"))
+        asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE))
+        return {**asked, **turn_accuracy(model, turns), **held_out_metrics(model, {"": lessons.episode})}

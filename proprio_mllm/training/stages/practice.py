@@ -13,10 +13,9 @@ import numpy as np
 
 from data.shards import ShardReader, config_hash
 from proprio_mllm.model.building import load_model, save_model
-from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError
 from proprio_mllm.training.rollouts import DaggerRequest
-from proprio_mllm.training.words import WordsObjective, held_out_metrics
+from proprio_mllm.training.words import WordsObjective, held_out_metrics, mixed
 
 __all__ = ["PracticeStage"]
 
@@ -54,13 +53,7 @@ class PracticeStage:
         )
         pipeline.collect_dagger(request, workers=cfg.workers)
         taught, own = lessons.logged(pipeline.paths.shards("lessons")), lessons.logged(shards)
-
-        def episode(seed: int) -> WordEpisode:
-            draw = seed % 1000 / 1000
-            if draw < cfg.own_share:
-                return own(seed)
-            return taught(seed) if draw < cfg.own_share + cfg.logged else lessons.episode(seed)
-
+        episode = mixed(lessons.episode, (cfg.own_share, own), (cfg.logged, taught))
         model = load_model(student)
         model.requires_grad_(False)
         model.core.model.language_model.requires_grad_(True)

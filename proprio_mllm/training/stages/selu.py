@@ -38,6 +38,7 @@ from proprio_mllm.training.critic import (
     audit,
     critic_examples,
     keep,
+    turn_examples,
 )
 from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.goals import Relabel
@@ -45,7 +46,8 @@ from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.pipeline import Metrics, Pipeline
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
 from proprio_mllm.training.sources import Bodies, GoalQuestions
-from proprio_mllm.training.stages.inputs import demonstrations, text_rows
+from proprio_mllm.training.stages.inputs import demonstrations, lessons_of, text_rows, turns_of
+from proprio_mllm.training.turns import Turns
 
 __all__ = ["ACTOR", "CRITIC", "ExampleObjective", "SeluStage", "copy_adapter", "train_adapter"]
 
@@ -150,9 +152,15 @@ class _Selu:
             add_adapter(self.model, CRITIC)
             copy_adapter(self.model, ACTOR, CRITIC)
         self.collator = Collator(self.model.processor, self.model.cfg)
-        self.demos = demonstrations(self.pipeline, self.model.cfg)
-        self.goal_questions = GoalQuestions(self.pipeline.paths.shards("goal_questions"), self.model.cfg)
-        self.text_planning = text_rows(self.pipeline, self.model.cfg, self.demos)
+        cfg, paths = self.model.cfg, self.pipeline.paths
+        self.turns: Turns | None = None
+        if cfg.episodes:
+            self.demos = lessons_of(self.pipeline, cfg)
+            self.turns = turns_of(self.pipeline, self.model, self.demos, self.tokenizer)
+        else:
+            self.demos = demonstrations(self.pipeline, cfg)
+            self.goal_questions = GoalQuestions(paths.shards("goal_questions"), cfg)
+            self.text_planning = text_rows(self.pipeline, cfg, self.demos)
         self._tokens = None if self.tokenizer is None else self.demos.tokens(self.tokenizer)
         self._bodies = None if self._tokens is None else Bodies(self.demos, self._tokens)
 
@@ -160,12 +168,14 @@ class _Selu:
         return None if self._tokens is None else self._tokens[index].tolist()
 
     def _judging(self, rng: np.random.Generator) -> Example:
-        if rng.random() < IN_WORDS:
+        if self.turns is None and rng.random() < IN_WORDS:
             return self.goal_questions.draw(rng)
         index = int(self.demos.draw(rng, 1)[0])
         return judge_example(self.demos, index, rng, self._tokens)
 
     def _planning(self, rng: np.random.Generator) -> Example:
+        if self.turns is not None:
+            return self.turns.draw(rng, 1)[0]
         if rng.random() < self.pipeline.cfg.alignment.text_share:
             return self.text_planning.draw(rng, self._bodies)
         index = int(self.demos.draw(rng, 1)[0])
@@ -212,7 +222,7 @@ class _Selu:
         )
         kept = keep(trajectories, goals, judge, self.cfg.per_class)
         metrics |= {f"after_{name}": value for name, value in audit(trajectories, goals, judge).items()}
-        steps = actor_examples(kept, style, last)
+        steps = turn_examples(self.model, kept) if self.turns is not None else actor_examples(kept, style, last)
         metrics |= {
             "episodes": float(len(trajectories)),
             "actor_success": float(np.mean([t.rollout.success for t in trajectories])),
@@ -228,7 +238,7 @@ class _Selu:
 
 
 class SeluStage:
-    """Rounds of acting, judging, relabelling and learning."""
+    """Rounds of acting, judging, relabelling and learning; the model says whether it reads whole episodes."""
 
     name = "selu"
     needs = ("alignment",)

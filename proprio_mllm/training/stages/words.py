@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from configs.schema.model import ModelConfig
 from proprio_mllm.model.building import build_model, build_processor, save_model
 from proprio_mllm.model.word_tokens import add_word_tokens
-from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError, base_model_config
-from proprio_mllm.training.words import WordsObjective, held_out_metrics
+from proprio_mllm.training.words import WordsObjective, held_out_metrics, mixed
 
 __all__ = ["WordsStage"]
 
@@ -26,15 +26,14 @@ class WordsStage:
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The loop and the plain backbone."""
-        model = dataclasses.asdict(base_model_config(pipeline.cfg.model))
-        return {"words": dataclasses.asdict(pipeline.cfg.words), "model": model}
+        return {"words": dataclasses.asdict(pipeline.cfg.words), "model": dataclasses.asdict(_plain(pipeline.cfg.model))}
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
         """Trains and stores the model; measures it on episodes that it was not trained on."""
         lessons, share = pipeline.lessons, pipeline.cfg.words.logged
         if lessons is None:
             raise StageError("stage 'words' needs a source of lessons: run it with `python train.py stage=words`")
-        cfg = dataclasses.replace(base_model_config(pipeline.cfg.model), episodes=True)
+        cfg = _plain(pipeline.cfg.model)
         words = lessons.words()
         processor = build_processor(cfg, [" ".join(words)] * 2)
         add_word_tokens(processor.tokenizer, words)
@@ -42,11 +41,12 @@ class WordsStage:
         model.requires_grad_(False)
         model.core.model.language_model.requires_grad_(True)
         logged = lessons.logged(pipeline.paths.shards("lessons"))
-
-        def episode(seed: int) -> WordEpisode:
-            return logged(seed) if seed % 1000 < 1000 * share else lessons.episode(seed)
-
+        episode = mixed(lessons.episode, (share, logged))
         objective = WordsObjective(model, episode, key, pipeline.cfg.words.reading)
         pipeline.loop(objective, pipeline.cfg.words.loop, folder / "loop")
         save_model(model.eval(), pipeline.paths.model("words"))
         return held_out_metrics(model, {"": lessons.episode, "_logged": logged})
+
+
+def _plain(model: ModelConfig) -> ModelConfig:
+    return dataclasses.replace(base_model_config(model), episodes=True, sees=False)

@@ -1,0 +1,91 @@
+"""Decisions of whole episodes with what was seen and felt: logs of the simulator in the sequence that planners read.
+
+A row of `demos` shards is the moment before a step. The teacher's answer to it, and the words of its log, come from the same
+source as in stage `words`; its picture and its motion stand before the answer, as they do at run time
+(`proprio_mllm.model.observing`). Every row reads its log anew: beside 16 visual tokens that is little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from proprio_mllm.model.batch import Collator, Example
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.model.observing import pictured_turn
+from proprio_mllm.model.word_tokens import WordTokens
+from proprio_mllm.model.wording import WordEpisode
+from proprio_mllm.training.sources import Demos
+
+__all__ = ["Turns", "turn_accuracy"]
+
+#: Longest log, tokens; what is longer is left out, as in stage `words`.
+_LONGEST = 320
+
+
+class Turns:
+    """Decisions with pictures, by row of the demonstrations that they come from.
+
+    Args:
+        model: gives the tokenizer.
+        demos: the rows, in the order of their folders.
+        folders: where the rows come from.
+        told: the teacher's answers to every episode of a folder; the k-th turn is the k-th row's.
+        tokens: the motion tokenizer; None for models without proprioception.
+
+    Attributes:
+        train: rows that have an answer and are learnt from.
+        test: those that are held out.
+    """
+
+    def __init__(
+        self,
+        model: ProprioMLLM,
+        demos: Demos,
+        folders: Sequence[Path],
+        told: Callable[[Path], Sequence[WordEpisode]],
+        tokens: MotionTokenizer | None = None,
+    ) -> None:
+        self._model, self._demos = model, demos
+        self._codes = None if tokens is None else demos.tokens(tokens)
+        self._told: dict[int, tuple[list[int], list[int], list[int]]] = {}
+        names = demos.reader.column("episode")
+        starts = [row for row, name in enumerate(names) if row == 0 or name != names[row - 1]]
+        episodes = [episode for folder in folders for episode in told(folder)]
+        for start, episode in zip(starts, episodes, strict=True):
+            words = WordTokens(model.processor.tokenizer)
+            log = words.tokens(episode.prefix)
+            for number, turn in enumerate(episode.turns):
+                if len(log) <= _LONGEST:
+                    self._told[start + number] = (list(log), words.tokens(turn.now), words.tokens(turn.answer))
+                log += words.tokens(turn.taken)
+        rows = np.array(sorted(self._told), dtype=np.int64)
+        self.train, self.test = np.intersect1d(rows, demos.split.train), np.intersect1d(rows, demos.split.test)
+
+    def draw(self, rng: np.random.Generator, size: int) -> list[Example]:
+        """Training decisions."""
+        return [self.example(int(row)) for row in rng.choice(self.train, size)]
+
+    def example(self, row: int) -> Example:
+        """The decision of a row."""
+        log, now, answer = self._told[row]
+        codes = None if self._codes is None else self._codes[row].tolist()
+        return pictured_turn(self._model, log, now, self._demos.view(self._demos.reader[row]), codes, answer)
+
+
+@torch.no_grad()
+def turn_accuracy(model: ProprioMLLM, turns: Turns, limit: int = 200, size: int = 8) -> dict[str, float]:
+    """Share of the words of held-out answers that are the likeliest after the right ones before them, and of whole answers."""
+    collator = Collator(model.processor, model.cfg)
+    rows: NDArray[np.int64] = turns.test[:: max(1, len(turns.test) // limit)][:limit]
+    right = words = whole = 0
+    for first in range(0, len(rows), size):
+        for row in rows[first : first + size]:
+            out = model(collator([turns.example(int(row))]).to(model.device))
+            right, words, whole = right + out.correct, words + out.supervised, whole + (out.correct == out.supervised)
+    return {"turn_words": right / max(words, 1), "turn_exact": whole / max(len(rows), 1), "turns": float(len(rows))}

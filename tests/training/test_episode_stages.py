@@ -1,0 +1,90 @@
+"""The stages where whole episodes are read: the language model is taken over, every decision carries its own picture."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from configs.compose import compose
+from configs.schema.train import TrainConfig
+from configs.validate import build
+from proprio_mllm.evaluation.lessons import Lessons
+from proprio_mllm.model.building import load_model
+from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.model.word_tokens import WordTokens
+from proprio_mllm.planners.words import plans_in_words
+from proprio_mllm.training.critic import Kept, Trajectory, turn_examples
+from proprio_mllm.training.pipeline import Pipeline
+from proprio_mllm.training.rollouts import read_rollouts
+from proprio_mllm.training.stages import stages_of
+from proprio_mllm.training.stages.inputs import lesson_folders, lessons_of, turns_of
+from tests.training.test_pipeline import _small, collect, correct
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
+    """Every stage, run once."""
+    torch.set_num_threads(1)
+    root = tmp_path_factory.mktemp("episodes")
+    overrides = ["budget=debug", f"output={root}", "logger.wandb=disabled", "model.episodes=true", "selu.truth=oracle"]
+    cfg = build(TrainConfig, compose("train", overrides))
+    small = dataclasses.replace(cfg, model=_small(cfg.model))
+    (root / "tiny").mkdir()
+    shutil.copytree(shards, root / "tiny" / "data")
+    shutil.copytree(shards / "demos", root / "tiny" / "data" / "lessons")
+    pipeline = Pipeline(stages_of(small.model), small, collect, "python train.py stage=all", correct, Lessons())
+    for stage in pipeline.stages:
+        assert pipeline.run(stage) is not None
+    return pipeline
+
+
+def test_every_stage_reads_the_one_before(trained: Pipeline) -> None:
+    assert list(trained.stages) == ["words", "practice", "base", "pointmap", "tokenizer", "alignment", "selu"]
+    assert trained.ancestors("selu") == tuple(trained.stages)
+    assert all(trained.run(stage) is None for stage in trained.stages)
+
+
+def test_all_models_plan_in_words_and_later_ones_see(trained: Pipeline) -> None:
+    assert all(plans_in_words(str(trained.paths.model(name))) for name in ("words", "practice", "base", "alignment", "selu"))
+    found = {name: load_model(trained.paths.model(name)).cfg for name in ("practice", "base", "selu")}
+    assert [cfg.sees for cfg in found.values()] == [False, True, True]
+    assert [cfg.proprioception for cfg in found.values()] == [False, False, True]
+
+
+def test_a_turn_is_the_decision_of_its_row(trained: Pipeline) -> None:
+    model, tokens = load_model(trained.paths.model("selu")), MotionTokenizer.load(trained.paths.model("tokenizer"))
+    demos = lessons_of(trained, model.cfg)
+    turns = turns_of(trained, model, demos, tokens)
+    told = [turn for folder in lesson_folders(trained) for one in Lessons().told(folder) for turn in one.turns]
+    rows = sorted((*turns.train, *turns.test))
+    assert len(rows) == len(told) > 50
+    words = WordTokens(model.processor.tokenizer)
+    for row, turn in list(zip(rows, told, strict=True))[::7]:
+        example = turns.example(int(row))
+        assert example.tokens is not None
+        learnt = [token for token, target in zip(example.tokens.ids, example.tokens.targets, strict=True) if target]
+        assert learnt == words.tokens(turn.answer)
+        assert np.array_equal(example.views[0].image, demos.view(demos.reader[int(row)]).image)
+
+
+def test_hindsight_names_the_sub_goal(trained: Pipeline) -> None:
+    model, tokens = load_model(trained.paths.model("selu")), MotionTokenizer.load(trained.paths.model("tokenizer"))
+    rollout = read_rollouts(trained.paths.stage("selu") / "round_0" / "rollouts")[0]
+    motion = tuple(tokens.encode_window(window) for window in rollout.motions)
+    examples = turn_examples(model, [Kept(Trajectory(rollout, motion), "Put the cup on the table.", rollout.length, True)])
+    words, texts = WordTokens(model.processor.tokenizer), list[str]()
+    names = {token: word for word, token in words.known.items()}
+    for example in examples:
+        assert example.tokens is not None
+        pairs = zip(example.tokens.ids, example.tokens.targets, strict=True)
+        texts.append(" ".join(names[token] for token, target in pairs if target))
+    assert texts == [
+        "Pick mug _1 do GoTo mug _1 .",
+        "Pick mug _1 do Pick left mug _1 .",
+        "Place coffee table _1 do Place left coffee table _1 .",
+    ]
