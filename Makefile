@@ -27,6 +27,7 @@ $(STAMP): requirements.lock pyproject.toml
 	touch $@
 
 eval: $(STAMP)
+	$(BIN)/python -m sim doctor quiet=true
 	$(BIN)/python eval.py planner=proprio robot=h1
 
 # The tests but those marked `slow`, on all cores up to four.

@@ -1,4 +1,7 @@
-"""Evaluates a planner, or assembles one of the paper's tables: `python eval.py planner=proprio robot=h1`."""
+"""Evaluates a planner, or assembles one of the paper's tables: `python eval.py planner=proprio robot=h1`.
+
+`python eval.py sanity=true` says in half a minute whether this machine does what it should.
+"""
 
 from __future__ import annotations
 
@@ -39,6 +42,18 @@ def run(cfg: EvalConfig) -> int:
     from proprio_mllm.report.experiments import assemble
     from proprio_mllm.report.runs import load_run, write_report
 
+    if cfg.sanity:
+        from proprio_mllm.evaluation.sanity import sanity
+
+        good = True
+        try:
+            for verdict in sanity():
+                console.print(verdict.to_text(), markup=False, soft_wrap=True)
+                good = good and verdict.good
+        except (WeightsError, OSError) as error:
+            console.print(f"eval.py: {error}", style="red", markup=False, soft_wrap=True)
+            return 1
+        return 0 if good else 1
     if cfg.experiment is not None:
         try:
             table, files = assemble(cfg.experiment, Path(cfg.output))

@@ -10,6 +10,7 @@ from configs.arguments import dispatch
 __all__ = ["COMMANDS"]
 
 COMMANDS: Final = {
+    "doctor": ("sim.tools.doctor", "what this machine has of what is needed, and what to do about the rest"),
     "look": ("sim.tools.look", "pictures of rooms, object types and robots"),
     "catalogue": ("sim.tools.catalogue", "types, rooms, robots, actions, failure codes and cameras, as a list or JSON"),
     "video": ("sim.tools.video", "film of an episode that you or the expert plan"),

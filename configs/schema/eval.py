@@ -167,6 +167,7 @@ class EvalConfig:
         retries: how often an episode with an infrastructure error is run again.
         output: folder of all outputs.
         experiment: assemble this instead of running episodes.
+        sanity: run two tasks on each robot with the expert, the rules and the tiny model, and keep nothing.
         reflection: whether failures are reflected on; planners that can take it from here (`planner.reflection`).
         backend: the language model that planners which chat ask, and a planner of a file that takes one; others have none.
         threads: episodes that go on at a time in one process (`workers=0`), each with a planner of its own whose calls wait
@@ -194,6 +195,7 @@ class EvalConfig:
     retries: int = 1
     output: str = "outputs"
     experiment: ExperimentConfig | None = None
+    sanity: bool = False
     reflection: Literal["on", "off"] = "on"
     backend: BackendConfig | None = None
     threads: int = 1

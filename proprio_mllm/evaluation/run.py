@@ -296,12 +296,13 @@ def _ready(cfg: EvalConfig) -> EvalConfig:
     return dataclasses.replace(cfg, backend=backend)
 
 
-def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
+def evaluate(cfg: EvalConfig, opener: Opener | None = None, told: bool = True) -> EvalRun:
     """Runs what is missing of an evaluation.
 
     Args:
         cfg: what to run.
         opener: opens sessions; the simulator's by default.
+        told: whether progress is shown.
 
     Returns:
         All planned episodes, those of earlier runs of the same command included; `stopped` tells when a cost cap or a backend
@@ -331,7 +332,7 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None) -> EvalRun:
     path = folder / "ledger.jsonl"
     with Ledger(path) as ledger:
         write_text(folder / "run.json", json.dumps(metadata, indent=1) + "\n")  # not while another process runs what it says
-        stopped = _run_missing(cfg, setup, jobs, ledger, path, opener)
+        stopped = _run_missing(cfg, setup, jobs, ledger, path, opener, told)
     everything = read_ledger(path)
     scores, wanted = scored(everything), [_fields_key(job) for job in jobs]
     keys = set(wanted)
@@ -348,7 +349,13 @@ def _check_scheduler(cfg: EvalConfig, planner: PlannerConfig) -> None:
 
 
 def _run_missing(
-    cfg: EvalConfig, setup: WorkerSetup, jobs: Sequence[EpisodeJob], ledger: Ledger, path: Path, opener: Opener | None
+    cfg: EvalConfig,
+    setup: WorkerSetup,
+    jobs: Sequence[EpisodeJob],
+    ledger: Ledger,
+    path: Path,
+    opener: Opener | None,
+    told: bool = True,
 ) -> str:
     """Runs what the ledger does not have, the longest episodes first, so that workers finish together; why it stopped."""
     scores = scored(read_ledger(path))
@@ -360,7 +367,7 @@ def _run_missing(
     solved = sum(record.outcome is Outcome.SUCCESS for record in known)
     title = f"{cfg.planner.name} {cfg.robot.name} {cfg.difficulty}"
     with (
-        tqdm(total=len(jobs), initial=len(known), desc=title, unit="episode") as bar,
+        tqdm(total=len(jobs), initial=len(known), desc=title, unit="episode", disable=not told) as bar,
         contextlib.closing(scheduled(cfg, setup, order, _to_repeat, opener)) as results,
     ):
         for result in results:
