@@ -19,6 +19,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from configs.arguments import announce
 from configs.compose import COMPOSITION_ERRORS, CONFIG_DIR, explain, open_fields, register
 from configs.help import asks_for_help, help_text
 from configs.validate import ConfigError, build
@@ -62,6 +63,7 @@ def run_app(root: str, schema: type[T], job: Callable[[T], int], about: str, arg
         The job's exit code, of a sweep that of a failed job; 2 for what does not compose or validate.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
+    announce(f"{root}.py", [*given, "--help"] if any(word.startswith("-") for word in given) else given)  # flags print at once
     before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors, and they are explained here
 

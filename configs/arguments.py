@@ -18,7 +18,7 @@ import yaml
 from configs.help import asks_for_help, tool_help
 from configs.validate import ConfigError, allowed_values, build
 
-__all__ = ["command", "dispatch", "read_arguments", "read_named"]
+__all__ = ["announce", "command", "dispatch", "read_arguments", "read_named"]
 
 T = TypeVar("T")
 
@@ -108,4 +108,11 @@ def dispatch(program: str, commands: Mapping[str, tuple[str, str]], arguments: S
     if name not in commands:
         sys.stderr.write(f"{program}: no command {name!r}; {allowed_values(name, commands)}\n")
         return 2
+    announce(f"{program} {name}", rest)
     return importlib.import_module(commands[name][0]).main(rest)
+
+
+def announce(program: str, arguments: Sequence[str]) -> None:
+    """A word at a terminal before imports that take seconds; help needs none."""
+    if sys.stderr.isatty() and not asks_for_help(arguments):
+        sys.stderr.write(f"{program}: starting\n")

@@ -6,8 +6,9 @@ standing, crouching and holding a plant with both hands. Not part of any experim
 
 from __future__ import annotations
 
+import functools
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,9 +32,8 @@ from sim.world.world import World
 __all__ = ["contact_sheet", "lid_sheet", "main", "robot_poses", "room_pictures", "room_sheet"]
 
 
-def room_pictures(folder: Path, robot: str = DEFAULT_ROBOT) -> list[Path]:
+def room_pictures(folder: Path, robot: str = DEFAULT_ROBOT) -> Iterator[Path]:
     """Overview, plan, head view at 500 and 112 pixels and side view of every room with its default objects."""
-    written: list[Path] = []
     for room in room_names():
         world = World(load_robot(robot), room)
         for camera, height, width in (
@@ -45,8 +45,7 @@ def room_pictures(folder: Path, robot: str = DEFAULT_ROBOT) -> list[Path]:
         ):
             path = folder / f"{room}_{camera}_{width}.png"
             iio.imwrite(path, world.cameras.render(camera, height, width).rgb)
-            written.append(path)
-    return written
+            yield path
 
 
 def room_sheet(width: int = 400, columns: int = 4) -> NDArray[np.uint8]:
@@ -118,18 +117,20 @@ def _tile(type_name: str, size: int, openness: float | None = None) -> NDArray[n
         return renderer.render().copy()
 
 
-def draw_all(folder: Path) -> list[Path]:
-    """Writes all pictures and returns their paths."""
+def draw_all(folder: Path) -> Iterator[Path]:
+    """Writes all pictures; gives each path as soon as it is there."""
     folder.mkdir(parents=True, exist_ok=True)
-    sheet = folder / "types.png"
-    iio.imwrite(sheet, contact_sheet())
-    iio.imwrite(folder / "lids.png", lid_sheet())
-    iio.imwrite(folder / "rooms.png", room_sheet())
-    written = [sheet, folder / "lids.png", folder / "rooms.png", *room_pictures(folder)]
-    for robot in available_robots():
-        written.append(folder / f"{robot}_poses.png")
-        iio.imwrite(written[-1], robot_poses(robot))
-    return written
+    poses = {f"{robot}_poses": functools.partial(robot_poses, robot) for robot in available_robots()}
+    sheets: dict[str, Callable[[], NDArray[np.uint8]]] = {
+        "rooms": room_sheet,
+        **poses,
+        "types": contact_sheet,
+        "lids": lid_sheet,
+    }
+    for name, draw in sheets.items():
+        iio.imwrite(folder / f"{name}.png", draw())
+        yield folder / f"{name}.png"
+    yield from room_pictures(folder)
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import io
+import sys
 
 import pytest
 
-from configs.arguments import dispatch
+from configs.arguments import announce, dispatch
 from proprio_mllm.__main__ import COMMANDS as PROPRIO
 from proprio_mllm.report.commands import COMMANDS as REPORT
 from sim.__main__ import COMMANDS as SIM
@@ -42,3 +44,21 @@ def test_every_report_has_a_help(command: str, capsys) -> None:
         code = end.code
     assert code == 0
     assert len(capsys.readouterr().out) > 50
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(("arguments", "told"), [(["out=x"], "tool: starting\n"), (["--help"], "")])
+def test_a_terminal_gets_a_word_at_once(arguments: list[str], told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = _Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    announce("tool", arguments)
+    assert terminal.getvalue() == told
+
+
+def test_a_file_gets_none(capsys: pytest.CaptureFixture[str]) -> None:
+    announce("tool", [])
+    assert capsys.readouterr().err == ""
