@@ -35,7 +35,7 @@ class VideoConfig:
         cameras: cameras side by side.
         size: side of each picture, pixels, even.
         fps: pictures per simulated second, at most 50.
-        pretty: shadows and reflections, several times slower.
+        pretty: a lamp with shadows and smooth edges, but in the head's pictures.
         out: the file; `video-TASK-TRIAL.mp4` in the run's folder by default.
     """
 
@@ -43,7 +43,7 @@ class VideoConfig:
     cameras: tuple[str, ...] = ("behind", "head")
     size: int = 400
     fps: int = 25
-    pretty: bool = False
+    pretty: bool = True
     out: str | None = None
 
     def __post_init__(self) -> None:

@@ -1,7 +1,7 @@
 """Pictures of rooms, object types and robots, for the eye: `python -m sim look [out=outputs/look]`.
 
 Writes each room from above and through the robot's head camera, a contact sheet of the types, their lids, and each robot
-standing, crouching and holding a plant with both hands. Not part of any experiment.
+standing, crouching and holding a box with both hands. Not part of any experiment.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ def room_pictures(folder: Path, robot: str = DEFAULT_ROBOT) -> Iterator[Path]:
             ("left", 500, 500),
         ):
             path = folder / f"{room}_{camera}_{width}.png"
-            iio.imwrite(path, world.cameras.render(camera, height, width).rgb)
+            iio.imwrite(path, world.cameras.render(camera, height, width, pretty=camera != "head").rgb)
             yield path
 
 
 def room_sheet(width: int = 400, columns: int = 4) -> NDArray[np.uint8]:
     """(rows * 0.75 * width, columns * width, 3) every room from above, with its objects, in the order of their names."""
-    tiles = [World(None, room).cameras.render("overview", width * 3 // 4, width).rgb for room in room_names()]
+    tiles = [World(None, room).cameras.render("overview", width * 3 // 4, width, pretty=True).rgb for room in room_names()]
     rows = -(-len(tiles) // columns)
     tiles += [np.full_like(tiles[0], 255)] * (rows * columns - len(tiles))
     return np.concatenate([np.concatenate(tiles[r * columns : (r + 1) * columns], axis=1) for r in range(rows)], axis=0)
@@ -66,7 +66,7 @@ def contact_sheet(size: int = 112, columns: int = 12) -> NDArray[np.uint8]:
 
 
 def robot_poses(robot: str, size: int = 420) -> NDArray[np.uint8]:
-    """(size, 3 * size, 3) the robot standing, crouching as low as it can, and holding a plant with both hands."""
+    """(size, 3 * size, 3) the robot standing, crouching as low as it can, and holding a box with both hands."""
     session = Session(robot)
     task = next(task for task in load_benchmark() if task.family == "lift" and task.room == "living_room_1")
     session.reset(task, seed=0)
@@ -87,14 +87,14 @@ def robot_poses(robot: str, size: int = 420) -> NDArray[np.uint8]:
 
 def _portrait(session: Session, size: int) -> NDArray[np.uint8]:
     """The robot from its front left, without the walls between."""
-    world, base = session.world, session.body.base.measured()
-    camera = mujoco.MjvCamera()
-    tall_m = session.body.spec.standing_pelvis_height_m
-    camera.lookat[:] = [base.x, base.y, 0.9 * tall_m]
-    camera.distance, camera.azimuth, camera.elevation = 1.0 + 2.1 * tall_m, np.rad2deg(base.yaw_rad) + 215.0, -12.0
-    with mujoco.Renderer(world.model, size, size) as renderer:
-        renderer.update_scene(world.data, camera)
-        return renderer.render().copy()
+    base, tall_m = session.body.base.measured(), session.body.spec.standing_pelvis_height_m
+    yaw, down, away_m = base.yaw_rad + np.deg2rad(35.0), np.deg2rad(12.0), 1.0 + 2.1 * tall_m
+    ahead = -np.array([np.cos(yaw) * np.cos(down), np.sin(yaw) * np.cos(down), np.sin(down)])
+    right = np.array([ahead[1], -ahead[0], 0.0]) / np.hypot(ahead[0], ahead[1])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    pose[:3, 3] = np.array([base.x, base.y, 0.9 * tall_m]) - away_m * ahead
+    return session.world.cameras.render_from(pose, 45.0, size, size, pretty=True)
 
 
 def lid_sheet(size: int = 224) -> NDArray[np.uint8]:

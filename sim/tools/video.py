@@ -51,7 +51,7 @@ class VideoConfig:
         cameras: cameras side by side.
         size: side of each picture, pixels, even.
         fps: pictures per simulated second, at most 50.
-        pretty: shadows and reflections, several times slower.
+        pretty: a lamp with shadows and smooth edges, but in the head's pictures, which stay what a planner sees.
         difficulty: easy, medium, hard or natural.
         seed: key of the luck.
     """
@@ -64,7 +64,7 @@ class VideoConfig:
     cameras: tuple[str, ...] = ("behind", "head")
     size: int = 400
     fps: int = 25
-    pretty: bool = False
+    pretty: bool = True
     difficulty: str = "easy"
     seed: int = 0
 
@@ -110,11 +110,12 @@ class VideoRecorder:
         cameras: Sequence[str] = ("behind", "head"),
         size: int = 400,
         fps: int = 25,
-        pretty: bool = False,
+        pretty: bool = True,
     ) -> None:
         self._session, self._path = session, Path(path)
         self._cameras, self._fps = tuple(cameras), fps
-        self._renderer = Renderer(session.world.scene, size, size, pretty=pretty)
+        plain, lit = (Renderer(session.world.scene, size, size, pretty=wanted) for wanted in (False, pretty))
+        self._renderers = {camera: plain if camera == "head" else lit for camera in self._cameras}
         self._world = session.world
         self._font = ImageFont.load_default(15)
         self._temporary = self._path.with_name(f".{self._path.stem}.{os.getpid()}.mp4")
@@ -153,7 +154,7 @@ class VideoRecorder:
             self._write(self._picture(text))
 
     def _picture(self, caption: str) -> NDArray[np.uint8]:
-        views = np.concatenate([self._renderer.view(camera).rgb for camera in self._cameras], axis=1)
+        views = np.concatenate([self._renderers[camera].view(camera).rgb for camera in self._cameras], axis=1)
         bar = Image.new("RGB", (views.shape[1], _CAPTION_PX), (24, 24, 28))
         ImageDraw.Draw(bar).text((8, 5), caption, fill=(240, 240, 240), font=self._font)
         return np.concatenate([views, np.asarray(bar, dtype=np.uint8)], axis=0)

@@ -40,6 +40,12 @@ MAX_SIZE: Final = 1280
 VISIBILITY_SIZE: Final = 112
 _LEAST_PIXELS: Final = 6
 _MAX_GEOMS: Final = 1500
+#: For people: samples of a pixel; what is left of the lights that planners see by; the lamp's strength and place.
+_SAMPLES: Final = 8
+_HEADLIGHT, _FILL = 0.75, 0.5
+_LAMP, _LAMP_ABOVE_M = 0.5, 1.0
+#: Greys of black robots: brighter ones are left alone; parts with a larger radius are shells.
+_BLACK, _SHELL, _JOINT, _SHELL_M = 0.25, 0.68, 0.3, 0.14
 #: A camera of the room that stands in for one that is put somewhere for a picture.
 _FREE: Final = "overview"
 #: A geom group that is not drawn.
@@ -119,6 +125,18 @@ def _camera_id(scene: SceneState, camera: str) -> int:
     return index
 
 
+def _greys(scene: SceneState) -> dict[int, float]:
+    """Greys for the meshes of a robot that is black all over, by geom: large shells are light, what joins them is dark."""
+    model, mesh = scene.model, int(mujoco.mjtGeom.mjGEOM_MESH)
+    found: dict[int, float] = {}
+    for geom in range(model.ngeom):
+        colour = model.mat_rgba[model.geom_matid[geom]] if model.geom_matid[geom] >= 0 else model.geom_rgba[geom]
+        mine = int(model.geom_bodyid[geom]) in scene.robot_bodies and int(model.geom_type[geom]) == mesh
+        if mine and float(colour[:3].max()) < _BLACK:
+            found[geom] = _SHELL if float(model.geom_rbound[geom]) > _SHELL_M else _JOINT
+    return found
+
+
 class Renderer:
     """Draws a world at one size.
 
@@ -126,7 +144,7 @@ class Renderer:
         scene: what is drawn; it may advance between calls.
         height: rows, at most 1280.
         width: columns, at most 1280.
-        pretty: shadows and reflections, for demonstration videos.
+        pretty: a lamp at the ceiling that casts shadows, and smooth edges, for people; planners get plain pictures.
 
     Raises:
         ValueError: on a size outside 1..1280.
@@ -137,7 +155,7 @@ class Renderer:
         if not (1 <= height <= MAX_SIZE and 1 <= width <= MAX_SIZE):
             raise ValueError(f"image size {height} x {width} outside 1..{MAX_SIZE}")
         self._scene, self._height, self._width, self._pretty = scene, height, width, pretty
-        self._canvas = shared_canvas(scene.model, scene.name, height, width)
+        self._canvas = shared_canvas(scene.model, scene.name, height, width, _SAMPLES if pretty else 0)
         self._drawn = mujoco.MjvScene(scene.model, maxgeom=_MAX_GEOMS)
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = 0
@@ -147,6 +165,7 @@ class Renderer:
         self._camera.type = int(mujoco.mjtCamera.mjCAMERA_FIXED)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._drawn.flags[int(flag)] = int(pretty)
+        self._shades = _greys(scene) if pretty else {}
         self._planes = np.flatnonzero(scene.model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))
         robot = np.isin(scene.model.geom_bodyid, list(scene.robot_bodies))
         labels = np.where(robot, _ROBOT, scene.object_of_geom).astype(np.int32)
@@ -189,7 +208,32 @@ class Renderer:
         mujoco.mjv_updateScene(scene.model, scene.data, self._option, None, self._camera, everything, self._drawn)
         groups[:] = kept
         scene.data.cam_xpos[index] = place
+        if self._pretty:
+            self._light()
         return pose
+
+    def _light(self) -> None:
+        """A lamp over the middle of the ceiling that alone casts shadows, and little light from everywhere."""
+        ceiling = self._scene.data.geom("ceiling")
+        for geom in self._drawn.geoms[: self._drawn.ngeom]:
+            if geom.objtype != int(mujoco.mjtObj.mjOBJ_GEOM):
+                continue
+            if geom.objid == ceiling.id:
+                geom.category = int(mujoco.mjtCatBit.mjCAT_DECOR)  # so it casts no shadow
+            elif geom.objid in self._shades:
+                geom.rgba[:3] = self._shades[geom.objid]
+        for light in self._drawn.lights[: self._drawn.nlight]:
+            light.castshadow = 0
+            share = _HEADLIGHT if light.headlight else _FILL
+            light.ambient[:], light.diffuse[:] = light.ambient * share, light.diffuse * share
+        lamp = self._drawn.lights[self._drawn.nlight]
+        self._drawn.nlight += 1
+        lamp.id, lamp.headlight, lamp.castshadow, lamp.texid = -1, 0, 1, -1
+        lamp.type = int(mujoco.mjtLightType.mjLIGHT_SPOT)
+        lamp.pos[:], lamp.dir[:] = ceiling.xpos + (0.0, 0.0, _LAMP_ABOVE_M), (0.0, 0.0, -1.0)
+        lamp.attenuation[:], lamp.cutoff, lamp.exponent = (1.0, 0.0, 0.0), 80.0, 0.0
+        lamp.bulbradius, lamp.intensity, lamp.range = 0.05, 0.0, 20.0
+        lamp.ambient[:], lamp.diffuse[:], lamp.specular[:] = 0.0, _LAMP, 0.1
 
     def labels(self, camera: str = "head") -> NDArray[np.int32]:
         """(H, W) segmentation of one camera as in `View`, without drawing its colours.
@@ -231,15 +275,24 @@ class Cameras:
 
     def __init__(self, scene: SceneState, poses: ObjectPoses, servos: Servos) -> None:
         self._scene, self._poses, self._servos = scene, poses, servos
-        self._renderers: dict[tuple[int, int], Renderer] = {}
+        self._renderers: dict[tuple[int, int, bool], Renderer] = {}
 
     def render(
-        self, camera: str = "head", height: int = 112, width: int = 112, *, depth: bool = False, segmentation: bool = False
+        self,
+        camera: str = "head",
+        height: int = 112,
+        width: int = 112,
+        *,
+        depth: bool = False,
+        segmentation: bool = False,
+        pretty: bool = False,
     ) -> View:
-        """Draws a camera of `CAMERAS`."""
-        return self._renderer(height, width).view(camera, depth=depth, segmentation=segmentation)
+        """Draws a camera of `CAMERAS`; `pretty` as in `Renderer`."""
+        return self._renderer(height, width, pretty).view(camera, depth=depth, segmentation=segmentation)
 
-    def render_from(self, pose: NDArray[np.float64], fovy_deg: float, height: int = 112, width: int = 112) -> NDArray[np.uint8]:
+    def render_from(
+        self, pose: NDArray[np.float64], fovy_deg: float, height: int = 112, width: int = 112, *, pretty: bool = False
+    ) -> NDArray[np.uint8]:
         """(H, W, 3) picture of a camera that stands anywhere.
 
         Args:
@@ -247,6 +300,7 @@ class Cameras:
             fovy_deg: its vertical field of view.
             height: rows.
             width: columns.
+            pretty: as in `Renderer`.
         """
         model, data, index = self._scene.model, self._scene.data, _camera_id(self._scene, _FREE)
         owners = ((model, "cam_pos"), (model, "cam_quat"), (model, "cam_fovy"), (data, "cam_xpos"), (data, "cam_xmat"))
@@ -257,7 +311,7 @@ class Cameras:
         try:
             for (owner, name), value in zip(owners, values, strict=True):
                 getattr(owner, name)[index] = value
-            return self._renderer(height, width).view(_FREE).rgb
+            return self._renderer(height, width, pretty).view(_FREE).rgb
         finally:
             for (owner, name), value in zip(owners, before, strict=True):
                 getattr(owner, name)[index] = value
@@ -285,8 +339,8 @@ class Cameras:
         """Drops the renderers; the shared OpenGL contexts stay with the process, and drawing goes on when asked again."""
         self._renderers.clear()
 
-    def _renderer(self, height: int, width: int) -> Renderer:
-        renderer = self._renderers.get((height, width))
-        if renderer is None:
-            renderer = self._renderers[height, width] = Renderer(self._scene, height, width)
-        return renderer
+    def _renderer(self, height: int, width: int, pretty: bool = False) -> Renderer:
+        key = height, width, pretty
+        if key not in self._renderers:
+            self._renderers[key] = Renderer(self._scene, height, width, pretty=pretty)
+        return self._renderers[key]

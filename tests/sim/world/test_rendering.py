@@ -158,3 +158,20 @@ def test_canvases_that_are_given_up_harm_no_other() -> None:
     assert np.array_equal(view.rgb, again.rgb) and np.array_equal(view.segmentation, again.segmentation)
     lamp = World(None, "living_room_1")
     assert len(np.unique(lamp.cameras.render("overview", 64, 64, segmentation=True).segmentation)) > 5
+
+
+def test_pictures_for_people_have_shadows_and_leave_those_of_planners_alone(world: World) -> None:
+    before = [world.cameras.render(camera, 120, 160).rgb for camera in ("head", "overview")]
+    pretty = world.cameras.render("overview", 120, 160, pretty=True).rgb
+    after = [world.cameras.render(camera, 120, 160).rgb for camera in ("head", "overview")]
+    assert all(np.array_equal(one, other) for one, other in zip(before, after, strict=True))
+    assert np.abs(pretty.astype(int) - after[1]).mean() > 5.0
+    assert np.array_equal(pretty, world.cameras.render("overview", 120, 160, pretty=True).rgb)
+
+
+@pytest.mark.parametrize("camera", ["left", "overview"])
+def test_the_lamp_shines_through_the_ceiling(world: World, camera: str) -> None:
+    """A ceiling that cast a shadow would leave all but the tops of the walls in the dark."""
+    plain, pretty = (world.cameras.render(camera, 120, 160, pretty=one).rgb.astype(int) for one in (False, True))
+    floor = slice(90, 120)
+    assert pretty[floor].mean() > 0.85 * plain[floor].mean()
