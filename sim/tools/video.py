@@ -19,6 +19,7 @@ import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
+from tqdm import tqdm
 
 from configs.arguments import command, read_arguments
 from configs.validate import ConfigError, allowed_values
@@ -120,6 +121,7 @@ class VideoRecorder:
         self._font = ImageFont.load_default(15)
         self._temporary = self._path.with_name(f".{self._path.stem}.{os.getpid()}.mp4")
         self._file: Any = None
+        self._bar: Any = None
         self._due_s = 0.0
         self.frames = 0
 
@@ -127,6 +129,7 @@ class VideoRecorder:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._file = iio.imopen(self._temporary, "w", plugin="pyav")
         self._file.init_video_stream("libx264", fps=self._fps, pixel_format="yuv420p")
+        self._bar = tqdm(desc=self._path.name, unit="frame", disable=None, leave=False)  # shown at a terminal alone
         self._session.watchers.append(self._tick)
         self.hold(_HOLD_S, self._session.task.instruction)
         return self
@@ -134,6 +137,7 @@ class VideoRecorder:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._session.watchers.remove(self._tick)
         self._file.close()
+        self._bar.close()
         if kind is None:
             self._temporary.replace(self._path)
         else:
@@ -162,6 +166,7 @@ class VideoRecorder:
     def _write(self, picture: NDArray[np.uint8]) -> None:
         self._file.write_frame(picture)
         self.frames += 1
+        self._bar.update(1)
 
 
 def _task(config: VideoConfig) -> TaskLike:
