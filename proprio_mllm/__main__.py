@@ -7,7 +7,7 @@ from typing import Final
 
 from configs.arguments import dispatch
 
-__all__ = ["COMMANDS"]
+__all__ = ["COMMANDS", "main"]
 
 COMMANDS: Final = {
     "report": ("proprio_mllm.report.commands", "tables, pages, films and exports of runs, motion data and tokenizers"),
@@ -15,5 +15,11 @@ COMMANDS: Final = {
     "serve": ("proprio_mllm.backends.serve", "a checkpoint as an OpenAI-compatible server"),
 }
 
+
+def main() -> int:
+    """The command line; returns the exit code."""
+    return dispatch("python -m proprio_mllm", COMMANDS, sys.argv[1:])
+
+
 if __name__ == "__main__":
-    sys.exit(dispatch("python -m proprio_mllm", COMMANDS, sys.argv[1:]))
+    sys.exit(main())

@@ -7,7 +7,7 @@ from typing import Final
 
 from configs.arguments import dispatch
 
-__all__ = ["COMMANDS"]
+__all__ = ["COMMANDS", "main"]
 
 COMMANDS: Final = {
     "doctor": ("sim.tools.doctor", "what this machine has of what is needed, and what to do about the rest"),
@@ -20,5 +20,11 @@ COMMANDS: Final = {
     "serve": ("sim.interfaces.remote.serve", "the Controller over HTTP"),
 }
 
+
+def main() -> int:
+    """The command line; returns the exit code."""
+    return dispatch("python -m sim", COMMANDS, sys.argv[1:])
+
+
 if __name__ == "__main__":
-    sys.exit(dispatch("python -m sim", COMMANDS, sys.argv[1:]))
+    sys.exit(main())

@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -31,6 +32,8 @@ _PATIENCE_S: Final = 20
 _MEMORY_GB: Final = 4
 #: Of each backend, the library and the system packages that bring it.
 _LIBRARIES: Final = {"egl": ("EGL", "libegl1 libgl1-mesa-dri"), "osmesa": ("OSMesa", "libosmesa6")}
+#: Extras that commands of this repository need.
+_EXTRAS: Final = ("train", "llm")
 _DRAW: Final = """
 import mujoco
 context = mujoco.GLContext(16, 16)
@@ -63,18 +66,26 @@ def _python() -> Finding:
 
 
 def _packages() -> Finding:
-    lock = Path("requirements.lock")
-    if not lock.is_file():
-        return Finding("no requirements.lock here, versions are not compared")
+    """What pyproject.toml asks for is there, in the versions that requirements.lock pins."""
+    lock, project = Path("requirements.lock"), Path("pyproject.toml")
+    if not (lock.is_file() and project.is_file()):
+        return Finding("no requirements.lock and pyproject.toml here, nothing is compared")
     pins = dict(re.findall(r"^([\w.-]+)==([^\s;]+)", lock.read_text(encoding="utf-8"), re.MULTILINE))
-    found = {name: _version(name) for name in pins}
-    missing = [name for name in pins if found[name] is None]
-    others = [f"{name} {found[name]} (pinned {pin})" for name, pin in pins.items() if found[name] not in (None, pin)]
-    if missing:
-        return Finding(f"missing: {', '.join(missing)}", "run `make setup`", True)
+    asked = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
+    groups = {"": asked["dependencies"]} | {name: asked["optional-dependencies"][name] for name in _EXTRAS}
+    absent = {group: [name for name in map(_name, wanted) if _version(name) is None] for group, wanted in groups.items()}
+    if absent[""]:
+        return Finding(f"missing: {', '.join(absent[''])}", "run `make setup`", True)
+    here = {name: found for name in pins if (found := _version(name)) is not None}
+    others = [f"{name} {found} (pinned {pins[name]})" for name, found in here.items() if found != pins[name]]
     if others:
         return Finding(f"other versions: {', '.join(others)}", "run `make setup` for the tested ones")
-    return Finding(f"{len(pins)} as pinned")
+    without = [name for name in _EXTRAS if absent[name]]
+    return Finding(f"{len(here)} as pinned{', without the extras ' + ' and '.join(without) if without else ''}")
+
+
+def _name(requirement: str) -> str:
+    return re.split(r"[<>=!~\[; ]", requirement, maxsplit=1)[0]
 
 
 def _version(name: str) -> str | None:
@@ -134,7 +145,7 @@ def _torch() -> Finding:
     try:
         found = version("torch")
     except PackageNotFoundError:
-        return Finding("none", "run `make setup`; the simulator, rules and expert do without")
+        return Finding("none", "for models, `make setup` or the extra `train`; simulator, rules and expert do without")
     seen = "an NVIDIA driver is here" if shutil.which("nvidia-smi") else "no NVIDIA driver is here"
     return Finding(f"{found}, {seen}")
 

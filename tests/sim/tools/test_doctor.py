@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sim.tools import doctor
@@ -49,10 +50,16 @@ def test_a_library_that_is_not_there_is_not_tried(monkeypatch: pytest.MonkeyPatc
 def test_other_and_missing_versions_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert not doctor._packages().remedy
-    (tmp_path / "requirements.lock").write_text("numpy==0.1\n")
+    lock, project = tmp_path / "requirements.lock", tmp_path / "pyproject.toml"
+    project.write_text(
+        '[project]\ndependencies = ["numpy>=2"]\noptional-dependencies = {train = ["no-such-thing"], llm = []}\n'
+    )
+    lock.write_text("numpy==0.1\n")
     assert "numpy" in doctor._packages().found
     assert not doctor._packages().fatal
-    (tmp_path / "requirements.lock").write_text("no-such-thing==1.0\n")
+    lock.write_text(f"numpy=={np.__version__}\nno-such-thing==1.0\n")
+    assert doctor._packages() == Finding("1 as pinned, without the extras train")
+    project.write_text('[project]\ndependencies = ["no-such-thing>1"]\noptional-dependencies = {train = [], llm = []}\n')
     assert doctor._packages() == Finding("missing: no-such-thing", "run `make setup`", True)
     assert "train.py" in doctor._weights().remedy
 
