@@ -71,3 +71,18 @@ def test_invalid_text_uses_up_the_budget():
     assert not any(ends[:-1])
     assert ends[-1]
     env.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mode", "context"), [("sync", {}), ("async", {"context": "spawn"})])
+def test_several_side_by_side(mode, context):
+    envs = gym.make_vec(
+        "sim.interfaces.env:DualTHOR-v0", 2, mode, image_size=28, render_mode="rgb_array", vector_kwargs=context
+    )
+    seen, _ = envs.reset(seed=0)
+    assert seen["image"].shape == (2, 28, 28, 3)
+    _, rewards, _, _, info = envs.step(("RotateLeft(10)", "Fly()"))
+    assert rewards.tolist() == [0.0, 0.0]
+    assert list(info["feedback"])[0] == "RotateLeft(10) ok"
+    assert len(envs.render()) == 2
+    envs.close()
