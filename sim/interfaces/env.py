@@ -5,8 +5,9 @@ the textual grammar of `data.interface.steps` (`Pick(left, Mug_1) & Open(right, 
 nothing, costs a step and is reported in `info`. Paper: DualTHOR as an environment; the reward is ours (share of goal
 conditions that hold, 1 at success).
 
-`gym.make("sim.interfaces.env:DualTHOR-v0", robot="x1")` makes one with Gymnasium's checker around it, `gym.make_vec` several. In
-processes of their own they take `vector_kwargs={"context": "spawn"}`: OpenGL does not survive a fork of a process that has drawn.
+`gym.make("sim.interfaces.env:DualTHOR-v0", robot="x1")` makes one with Gymnasium's checker around it, `gym.make_vec` several.
+In processes of their own they take `vector_kwargs={"context": "spawn"}`: OpenGL does not survive the fork of a process that has
+drawn.
 """
 
 from __future__ import annotations

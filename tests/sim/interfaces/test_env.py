@@ -83,6 +83,6 @@ def test_several_side_by_side(mode, context):
     assert seen["image"].shape == (2, 28, 28, 3)
     _, rewards, _, _, info = envs.step(("RotateLeft(10)", "Fly()"))
     assert rewards.tolist() == [0.0, 0.0]
-    assert list(info["feedback"])[0] == "RotateLeft(10) ok"
+    assert next(iter(info["feedback"])) == "RotateLeft(10) ok"
     assert len(envs.render()) == 2
     envs.close()
