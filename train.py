@@ -36,7 +36,10 @@ def make_data(cfg: TrainConfig) -> None:
 
 
 def make_shards(cfg: TrainConfig) -> None:
-    """Posed views, exercises in words, the expert's demonstrations and the rules' lessons on training tasks."""
+    """Posed views, exercises in words, the expert's demonstrations and the rules' lessons on training tasks.
+
+    Where whole episodes are read, views and lessons alone.
+    """
     from configs.schema.collect import CollectConfig as ShardConfig
     from proprio_mllm.evaluation.dagger import collect_lessons
     from proprio_mllm.training.paths import StagePaths
@@ -50,7 +53,8 @@ def make_shards(cfg: TrainConfig) -> None:
         ("demos", "demos", cfg.collect.episodes, 10),
         ("lessons", "demos", cfg.collect.lessons, 10),
     )
-    for name, kind, count, part in kinds:
+    wanted = [one for one in kinds if one[0] in ("views", "lessons")] if cfg.model.episodes else kinds
+    for name, kind, count, part in wanted:
         shards = ShardConfig(
             kind=kind, out=str(StagePaths(cfg).shards(name)), count=count, seed=cfg.seed, image_size=cfg.model.image_size,
             part_size=part, workers=cfg.collect.workers, robots=cfg.data.robots,
