@@ -15,7 +15,7 @@ QUICK := tests/configs tests/data/interface tests/model tests/planners tests/rep
   $(addprefix --ignore=tests/,$(addprefix report/test_,export.py figures.py notebook.py reconstruction.py tokenizer.py video.py) \
   $(addprefix planners/,chat/dag_plan/test_episode.py scripted/test_planner.py test_released.py))
 
-.PHONY: setup eval test test-slow quick check release-check serve motions lock third-party clean
+.PHONY: setup eval test test-slow quick check release-check serve motions lock pictures third-party clean
 
 setup: $(STAMP)
 
@@ -66,6 +66,10 @@ lock: $(STAMP)
 
 clean:
 	rm -rf $(VENV) outputs
+
+# The pictures of rooms and robots in the docs, and the film of the README.
+pictures: $(STAMP)
+	$(BIN)/python tools/pictures.py
 
 third-party: $(STAMP)
 	$(BIN)/python tools/third_party.py > THIRD_PARTY.md
