@@ -15,6 +15,7 @@ from data.interface.actions import ACTIONS, ActionKind, bringing_about
 from data.interface.belief import Belief
 from data.interface.bodies import Arm
 from data.interface.effects import Condition
+from data.interface.failures import FailureCode
 from data.interface.steps import Action
 from proprio_mllm.planners.scripted.words import Mention, type_of
 
@@ -195,12 +196,15 @@ def _through_held_door(pending: Sequence[Want], belief: Belief) -> list[Job]:
 def _work(want: Want, belief: Belief, known: Sequence[str]) -> list[Job]:
     """The next step towards a state that takes a tool, a vessel or heat."""
     if want.kind in _TOOL_VERBS:
-        arm = belief.state.arm_with(want.tool)
+        verb, arm = _TOOL_VERBS[want.kind], belief.state.arm_with(want.tool)
         if arm is None:
             return [_pick(want.tool, want.spoken_tool, None, belief)]
+        hangs = any(event.about(verb, want.obj) and event.code == FailureCode.NEEDS_STEADYING for event in belief.last)
+        if hangs and belief.state.held[arm.other] == want.obj:  # carried off what it rested on: it has to rest again
+            return [Job("Release", "", arm.other)]
         if want.obj in belief.unsteady and want.obj not in belief.state.in_place:
             return [Job("Hold", want.obj, arm.other, want.spoken_obj)]
-        return [Job(_TOOL_VERBS[want.kind], want.obj, arm, want.spoken_obj, want.source)]
+        return [Job(verb, want.obj, arm, want.spoken_obj, want.source)]
     if want.kind == "used_up":
         return [Job("UseUp", want.obj, None, want.spoken_obj, want.source)]
     if want.kind == "filled":

@@ -201,6 +201,14 @@ def test_what_rolls_away_is_held() -> None:
     assert answer("Slice the apple with the knife.", [*lines, "Hold(left, Apple_1) ok"], seen) == "Slice(right, Apple_1)"
 
 
+def test_what_hangs_in_the_hand_that_held_it_has_to_rest_again() -> None:
+    lines = ["GoTo(Knife_1) ok", "Pick(right, Knife_1) ok", "GoTo(Apple_1) ok", "Hold(left, Apple_1) ok", "MoveUp(0.1) ok"]
+    lines += ["Slice(right, Apple_1) NeedsSteadying"]
+    seen, task = ["Knife_1", "Apple_1"], "Slice the apple with the knife."
+    assert answer(task, lines, seen) == "Release(left)"
+    assert answer(task, [*lines, "Release(left) ok"], seen) == "Hold(left, Apple_1)"
+
+
 def test_filling() -> None:
     lines = ["GoTo(Mug_1) ok", "Pick(right, Mug_1) ok", "GoTo(Faucet_1) ok"]
     fill = "Fill the mug at the sink."
