@@ -63,7 +63,8 @@ def run_app(root: str, schema: type[T], job: Callable[[T], int], about: str, arg
         The job's exit code, of a sweep that of a failed job; 2 for what does not compose or validate.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
-    announce(f"{root}.py", [*given, "--help"] if any(word.startswith("-") for word in given) else given)  # flags print at once
+    if not any(word.startswith("-") for word in given):  # flags print at once
+        announce(f"{root}.py", given)
     before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors, and they are explained here
 

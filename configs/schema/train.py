@@ -37,6 +37,11 @@ def _require_shares(cfg: object, *names: str) -> None:
         require(0.0 <= getattr(cfg, name) <= 1.0, f"{name} {getattr(cfg, name)} outside [0, 1]")
 
 
+def _require_positive(cfg: object, *names: str) -> None:
+    for name in names:
+        require(getattr(cfg, name) > 0, f"{name} {getattr(cfg, name)} must be positive")
+
+
 @dataclass(frozen=True)
 class LoopConfig:
     """One run of the training loop.
@@ -71,10 +76,8 @@ class LoopConfig:
     adam_share: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "checkpoint_every", "log_every"):
-            require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
-        for name in ("lr", "adam_share"):
-            require(getattr(self, name) > 0.0, f"{name} {getattr(self, name)} must be positive")
+        _require_positive(self, "steps", "batch", "checkpoint_every", "log_every")
+        _require_positive(self, "lr", "adam_share")
         require(self.minutes >= 0.0, f"minutes {self.minutes} must not be negative")
 
 
@@ -146,8 +149,7 @@ class PracticeConfig:
     def __post_init__(self) -> None:
         _require_shares(self, "teacher_share", "own_share", "logged")
         require(self.own_share + self.logged <= 1.0, f"own_share {self.own_share} and logged {self.logged} exceed 1 together")
-        for name in ("episodes", "workers"):
-            require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
+        _require_positive(self, "episodes", "workers")
 
 
 @dataclass(frozen=True)
@@ -206,8 +208,7 @@ class SeluConfig:
 
     def __post_init__(self) -> None:
         _require_shares(self, "replay_share")
-        for name in ("rounds", "episodes", "per_class"):
-            require(getattr(self, name) > 0, f"{name} {getattr(self, name)} must be positive")
+        _require_positive(self, "rounds", "episodes", "per_class")
         require(self.temperature > 0.0, f"temperature {self.temperature} must be positive: exploration needs draws")
 
 

@@ -42,11 +42,11 @@ def corpus(
     """
     rng = np.random.default_rng(seed)
     texts = [caption for captions in clips.captions[:limit] for caption in captions]
-    for index in [] if demos is None else _some(demos.split.train, limit, rng):
-        assert demos is not None
-        example = demos.example(int(index), None)
-        texts.append(render(example.messages))
-    texts.extend(render(text_planning.draw(rng).messages) for _ in range(limit if text_planning else 0) if text_planning)
+    if demos is not None:
+        for index in _some(demos.split.train, limit, rng):
+            texts.append(render(demos.example(int(index), None).messages))
+    if text_planning is not None:
+        texts.extend(render(text_planning.draw(rng).messages) for _ in range(limit))
     texts.extend(render(phrase(clips, rng, cfg.prompt).messages) for _ in range(limit // 4))
     for index in _some(views.split.train, limit // 4, rng):
         row = views.row(int(index))

@@ -34,13 +34,13 @@ from sim.tasks.sample import TRAIN_SEEDS, rng_for, sample_task
 from sim.tasks.task import Task
 
 __all__ = [
-    "CATEGORY_SHARES",
     "Episode",
     "Student",
     "Teacher",
     "accepted",
     "dagger_of_part",
     "demos_of_part",
+    "draw_family",
     "lessons_of_part",
     "perturbed",
     "run_dagger_episode",
@@ -72,8 +72,8 @@ _LESSONS_FROM: Final = 700_000
 _PRACTICE_FROM: Final = 800_000
 _LESSON_STEPS: Final = 32
 _MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
-#: How often a lesson is of each category. Two things for two arms are learnt last.
-CATEGORY_SHARES: Final = (0.2, 0.5, 0.3)
+#: How often a drawn family is of each category. Two things for two arms are learnt last.
+_CATEGORY_SHARES: Final = (0.2, 0.5, 0.3)
 
 
 @dataclass(slots=True)
@@ -212,8 +212,7 @@ def run_lesson(
         student: the learned planner; without one the steps are the teacher's, with mistakes.
     """
     rng = rng_for("lessons", config.seed, index)
-    category = str(rng.choice(CATEGORIES, p=CATEGORY_SHARES))
-    family = str(rng.choice([name for name, kind in FAMILIES.items() if kind.category == category]))
+    family = draw_family(rng)
     sessions, number = {} if sessions is None else sessions, (_LESSONS_FROM if student is None else _PRACTICE_FROM) + index
     robot, task, session, observation = _start(config, number, rng, sessions, family=family)
     session.step_limit = _LESSON_STEPS
@@ -241,6 +240,12 @@ def run_lesson(
         nothing = {"executed": done.to_text(), "origin": "teacher"}
         episode.rows.append(_row(observation, task, robot, number, done, nothing))
     return episode
+
+
+def draw_family(rng: np.random.Generator) -> str:
+    """A family of tasks: a category, then a family of it."""
+    category = str(rng.choice(CATEGORIES, p=_CATEGORY_SHARES))
+    return str(rng.choice([name for name, kind in FAMILIES.items() if kind.category == category]))
 
 
 def _start(

@@ -24,11 +24,11 @@ from configs.schema.collect import CollectConfig
 from data.interface.failures import INVALID_OUTPUT
 from data.interface.observation import HistoryItem
 from data.interface.steps import PlanStep
-from sim.collection.demonstrations import CATEGORY_SHARES, accepted
+from sim.collection.demonstrations import accepted, draw_family
 from sim.collection.text_world import TextWorld, feedback_text
 from sim.robots.spec import load_robot
 from sim.tasks.drafts import Draft, NoDraft, Scene
-from sim.tasks.families import CATEGORIES, FAMILIES, draw, family_of
+from sim.tasks.families import draw, family_of
 from sim.tasks.sample import rng_for, scene_of
 
 __all__ = [
@@ -233,8 +233,7 @@ def draw_task(rooms: Sequence[str], rng: np.random.Generator) -> tuple[Draft, Sc
     """A task in one of some rooms or in a made-up one."""
     while True:
         scene = scene_of(str(rng.choice(rooms))) if rng.random() < 0.5 else _made_up(rng)
-        category = str(rng.choice(CATEGORIES, p=CATEGORY_SHARES))
-        family = str(rng.choice([name for name in FAMILIES if FAMILIES[name].category == category]))
+        family = draw_family(rng)
         try:
             return draw(family, scene, rng), scene
         except NoDraft:
