@@ -43,7 +43,16 @@ from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clip
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordBatch, WordsObjective
 
-__all__ = ["PHASES", "AlignmentData", "AlignmentObjective", "Episodes", "Phase", "body_state", "body_state_accuracy"]
+__all__ = [
+    "PHASES",
+    "AlignmentData",
+    "AlignmentObjective",
+    "Episodes",
+    "Exercises",
+    "Phase",
+    "body_state",
+    "body_state_accuracy",
+]
 
 Kind = Literal["say", "feel", "do", "fill", "say_image", "body", "plan", "text"]
 
@@ -66,6 +75,14 @@ PHASES: Final[Mapping[str, Phase]] = {
 
 
 @dataclass(frozen=True, slots=True)
+class Exercises:
+    """Where prompts are read: steps in words, and questions whether something was done."""
+
+    text_planning: TextPlanning
+    goal_questions: GoalQuestions
+
+
+@dataclass(frozen=True, slots=True)
 class Episodes:
     """Where whole episodes are read: decisions with pictures, and episodes in words."""
 
@@ -83,14 +100,11 @@ class AlignmentData:
         clips: Clips,
         views: Views,
         demos: Demos,
-        text_planning: TextPlanning | None,
-        goal_questions: GoalQuestions | None,
+        told: Exercises | Episodes,
         cfg: AlignmentConfig,
-        episodes: Episodes | None = None,
     ) -> None:
-        assert (text_planning is None) == (goal_questions is None) == (episodes is not None)
         self.tokenizer, self.clips, self.views, self.demos = tokenizer, clips, views, demos
-        self.text_planning, self.goal_questions, self.episodes = text_planning, goal_questions, episodes
+        self.told = told
         self._cfg, self._collator = cfg, Collator(model.processor, model.cfg)
         self._style: Style = model.cfg.prompt
         self._proprioception = model.cfg.proprioception
@@ -106,16 +120,16 @@ class AlignmentData:
 
     def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> tuple[Batch, ...] | Parts:
         """A batch of one kind from the training rows, in parts."""
-        if kind == "text" and self.episodes is not None:
-            return self.episodes.words.batch(rng, max(1, size // EPISODE_ROWS))
+        if kind == "text" and isinstance(self.told, Episodes):
+            return self.told.words.batch(rng, max(1, size // EPISODE_ROWS))
         return self._collator.in_parts(self._examples(kind, rng, size))
 
     def _examples(self, kind: Kind, rng: np.random.Generator, size: int) -> list[Example]:
         if kind == "text":
-            assert self.text_planning is not None
-            assert self.goal_questions is not None
+            assert isinstance(self.told, Exercises)
+            steps, questions = self.told.text_planning, self.told.goal_questions
             judged = rng.random(size) < self._cfg.judge_share
-            return [self.goal_questions.draw(rng) if one else self.text_planning.draw(rng, self.bodies) for one in judged]
+            return [questions.draw(rng) if one else steps.draw(rng, self.bodies) for one in judged]
         if kind == "plan":
             return [self._plan(int(i), rng) for i in self.demos.draw(rng, size)]
         if kind == "body":
@@ -132,8 +146,8 @@ class AlignmentData:
     def _plan(self, index: int, rng: np.random.Generator) -> Example:
         if rng.random() < self._cfg.judge_share:
             return judge_example(self.demos, index, rng, self._demo_tokens)
-        if self.episodes is not None:
-            return self.episodes.turns.draw(rng, 1)[0]
+        if isinstance(self.told, Episodes):
+            return self.told.turns.draw(rng, 1)[0]
         return self.demos.example(index, None if self._demo_tokens is None else self._demo_tokens[index].tolist())
 
     def _motion_text(self, kind: Kind, clip: int, codes: Sequence[int], rng: np.random.Generator) -> Example:
@@ -219,8 +233,8 @@ class AlignmentObjective:
     ) -> tuple[Tensor, Mapping[str, float]]:
         """Cross-entropy over the answers; nothing is drawn."""
         if isinstance(batch, WordBatch):
-            assert self._data.episodes is not None
-            return self._data.episodes.words.loss(module, batch, generator)
+            assert isinstance(self._data.told, Episodes)
+            return self._data.told.words.loss(module, batch, generator)
         kind, inputs = batch
         out = module(inputs)
         return out.loss, {f"{kind}_loss": float(out.loss.detach()), f"{kind}_accuracy": out.correct / max(out.supervised, 1)}

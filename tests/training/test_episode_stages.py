@@ -15,6 +15,7 @@ from configs.schema.train import TrainConfig
 from configs.validate import build
 from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.building import load_model
+from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.word_tokens import WordTokens
 from proprio_mllm.planners.words import plans_in_words
@@ -22,7 +23,7 @@ from proprio_mllm.training.critic import Kept, Trajectory, turn_examples
 from proprio_mllm.training.pipeline import Pipeline
 from proprio_mllm.training.rollouts import read_rollouts
 from proprio_mllm.training.stages import stages_of
-from proprio_mllm.training.stages.inputs import lesson_folders, lessons_of, turns_of
+from proprio_mllm.training.stages.inputs import episodes_in_words, lesson_folders, lessons_of, turns_of
 from tests.training.test_pipeline import _small, collect, correct
 
 
@@ -70,6 +71,18 @@ def test_a_turn_is_the_decision_of_its_row(trained: Pipeline) -> None:
         learnt = [token for token, target in zip(example.tokens.ids, example.tokens.targets, strict=True) if target]
         assert learnt == words.tokens(turn.answer)
         assert np.array_equal(example.views[0].image, demos.view(demos.reader[int(row)]).image)
+
+
+def test_episodes_in_words_are_learnt_through_the_adapter(trained: Pipeline) -> None:
+    model = load_model(trained.paths.model("alignment"), trainable=True)
+    train_only(model, ("lora",))
+    words = episodes_in_words(trained, model, "key")
+    for part in words.batch(np.random.default_rng(0), 2):
+        loss, _ = words.loss(model, part, torch.Generator())
+        loss.backward()
+    moved = [float(p.grad.abs().sum()) for p in model.parameters() if p.grad is not None]
+    assert moved
+    assert max(moved) > 0.0
 
 
 def test_hindsight_names_the_sub_goal(trained: Pipeline) -> None:

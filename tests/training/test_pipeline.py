@@ -23,7 +23,7 @@ from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.building import add_adapter, load_model
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.training import release
-from proprio_mllm.training.alignment import PHASES, AlignmentObjective
+from proprio_mllm.training.alignment import PHASES, AlignmentObjective, Exercises
 from proprio_mllm.training.pipeline import Pipeline, StageError, variant_model
 from proprio_mllm.training.rollouts import DaggerRequest, RolloutRequest, read_rollouts, rollout_row
 from proprio_mllm.training.sources import Demos, TextPlanning, shard_hash
@@ -235,7 +235,7 @@ def test_a_phase_changes_only_its_groups(trained: Pipeline, phase: str) -> None:
     views, demos = Views(shards("views"), model.cfg), Demos(shards("demos"), model.cfg)
     text_planning = TextPlanning(shards("text_planning"), model.cfg, demos)
     goal_questions = GoalQuestions(shards("goal_questions"), model.cfg)
-    data = AlignmentData(model, tokenizer, Clips(shards("clips")), views, demos, text_planning, goal_questions, cfg)
+    data = AlignmentData(model, tokenizer, Clips(shards("clips")), views, demos, Exercises(text_planning, goal_questions), cfg)
     train_only(model, PHASES[phase].groups)
     before = {name: tensor.detach().clone() for name, tensor in model.named_parameters()}
     trained.loop(AlignmentObjective(model, data, phase, cfg, "test"), cfg.joint, trained.paths.root / f"groups-{phase}")

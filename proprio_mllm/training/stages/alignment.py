@@ -13,7 +13,7 @@ from proprio_mllm.model.building import add_adapter, build_model, build_point_ma
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, Episodes, body_state_accuracy
+from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, Episodes, Exercises, body_state_accuracy
 from proprio_mllm.training.base import grounding_accuracy, plan_accuracy, text_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded, variant_model
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, GoalQuestions, Views
@@ -42,8 +42,8 @@ class AlignmentStage:
         model = start(pipeline)
         tokenizer = MotionTokenizer.load(pipeline.paths.model("tokenizer"))
         views, clips = Views(pipeline.paths.shards("views"), model.cfg), Clips(pipeline.paths.shards("clips"))
-        demos = self.demos(pipeline, model)
-        data = self.data(pipeline, model, tokenizer, clips, views, demos, key)
+        rows = self.rows(pipeline, model, tokenizer, key)
+        data = AlignmentData(model, tokenizer, clips, views, *rows, pipeline.cfg.alignment)
         # without proprioception there is nothing to align apart
         wanted = PHASES if model.cfg.proprioception else ("joint",)
         loops = {phase: getattr(pipeline.cfg.alignment, phase) for phase in wanted}
@@ -55,33 +55,22 @@ class AlignmentStage:
         read = tokenizer if model.cfg.proprioception else None
         save_model(model.eval(), pipeline.paths.model("alignment"), read)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
-        felt = body_state_accuracy(model, demos, read) if read is not None else {}
-        return {**asked, **felt, **self.planning(model, data, demos, read)}
+        felt = body_state_accuracy(model, data.demos, read) if read is not None else {}
+        return {**asked, **felt, **self.planning(model, data, read)}
 
-    def demos(self, pipeline: Pipeline, model: ProprioMLLM) -> Demos:
-        """Steps with pictures and motion."""
-        return demonstrations(pipeline, model.cfg)
-
-    def data(
-        self,
-        pipeline: Pipeline,
-        model: ProprioMLLM,
-        tokenizer: MotionTokenizer,
-        clips: Clips,
-        views: Views,
-        demos: Demos,
-        key: str,
-    ) -> AlignmentData:
-        """What the phases draw from."""
-        del key
-        text_planning = text_rows(pipeline, model.cfg, demos)
+    def rows(
+        self, pipeline: Pipeline, model: ProprioMLLM, tokenizer: MotionTokenizer, key: str
+    ) -> tuple[Demos, Exercises | Episodes]:
+        """Steps with pictures and motion, and what is asked in words."""
+        del tokenizer, key
+        demos = demonstrations(pipeline, model.cfg)
         questions = GoalQuestions(pipeline.paths.shards("goal_questions"), model.cfg)
-        return AlignmentData(model, tokenizer, clips, views, demos, text_planning, questions, pipeline.cfg.alignment)
+        return demos, Exercises(text_rows(pipeline, model.cfg, demos), questions)
 
-    def planning(self, model: ProprioMLLM, data: AlignmentData, demos: Demos, read: MotionTokenizer | None) -> Metrics:
+    def planning(self, model: ProprioMLLM, data: AlignmentData, read: MotionTokenizer | None) -> Metrics:
         """How often a held-out step is the teacher's."""
-        assert data.text_planning is not None
-        return {**plan_accuracy(model, demos, read), **text_accuracy(model, data.text_planning, data.bodies)}
+        assert isinstance(data.told, Exercises)
+        return {**plan_accuracy(model, data.demos, read), **text_accuracy(model, data.told.text_planning, data.bodies)}
 
 
 class EpisodeAlignmentStage(AlignmentStage):
@@ -91,30 +80,19 @@ class EpisodeAlignmentStage(AlignmentStage):
     shards = ("lessons",)
     recipe = 0
 
-    def demos(self, pipeline: Pipeline, model: ProprioMLLM) -> Demos:
-        """Rows of lessons."""
-        return lessons_of(pipeline, model.cfg)
-
-    def data(
-        self,
-        pipeline: Pipeline,
-        model: ProprioMLLM,
-        tokenizer: MotionTokenizer,
-        clips: Clips,
-        views: Views,
-        demos: Demos,
-        key: str,
-    ) -> AlignmentData:
-        """What the phases draw from."""
+    def rows(
+        self, pipeline: Pipeline, model: ProprioMLLM, tokenizer: MotionTokenizer, key: str
+    ) -> tuple[Demos, Exercises | Episodes]:
+        """Steps with pictures and motion, and episodes."""
+        demos = lessons_of(pipeline, model.cfg)
         turns = turns_of(pipeline, model, demos, tokenizer if model.cfg.proprioception else None)
-        episodes = Episodes(turns, episodes_in_words(pipeline, model, f"{key}/words"))
-        return AlignmentData(model, tokenizer, clips, views, demos, None, None, pipeline.cfg.alignment, episodes)
+        return demos, Episodes(turns, episodes_in_words(pipeline, model, f"{key}/words"))
 
-    def planning(self, model: ProprioMLLM, data: AlignmentData, demos: Demos, read: MotionTokenizer | None) -> Metrics:
+    def planning(self, model: ProprioMLLM, data: AlignmentData, read: MotionTokenizer | None) -> Metrics:
         """How often a held-out answer is the teacher's."""
-        del demos, read
-        assert data.episodes is not None
-        return turn_accuracy(model, data.episodes.turns)
+        del read
+        assert isinstance(data.told, Episodes)
+        return turn_accuracy(model, data.told.turns)
 
 
 def start(pipeline: Pipeline) -> ProprioMLLM:
