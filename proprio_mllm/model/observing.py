@@ -7,17 +7,45 @@ robot state in training and in use.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 from configs.schema.model import ModelConfig
 from data.interface.observation import Observation
+from data.interface.sightings import Seen, Sightings
 from proprio_mllm.model.batch import Example, View
 from proprio_mllm.model.chat import IMAGE, Encoded
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import plan_prompt, with_answer
 from proprio_mllm.model.vocabulary import motion_text
+from proprio_mllm.model.word_tokens import WordTokens
+from proprio_mllm.model.wording import log_words, prefix_words, state_words
 
-__all__ = ["motion_codes", "pictured_turn", "plan_example", "turn_example", "view_of"]
+__all__ = ["EpisodeLog", "motion_codes", "pictured_turn", "plan_example", "turn_example", "view_of"]
+
+
+@dataclass(slots=True)
+class EpisodeLog:
+    """An episode's log as tokens, observation by observation.
+
+    Attributes:
+        words: the episode's tokens.
+        sightings: what has been seen, and what the log says.
+        log: tokens of prefix and log.
+    """
+
+    words: WordTokens
+    sightings: Sightings = field(default_factory=Sightings)
+    log: list[int] = field(default_factory=list)
+
+    def look(self, observation: Seen) -> list[int]:
+        """Takes in an observation; the tokens of the state, which follow the log."""
+        self.sightings.look(observation)
+        if not self.log:
+            self.log = self.words.tokens(prefix_words(observation))
+        elif observation.history:
+            self.log += self.words.tokens(log_words(observation.history[-1], self.sightings.new))
+        return self.words.tokens(state_words(self.sightings))
 
 
 def view_of(observation: Observation) -> View:

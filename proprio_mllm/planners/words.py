@@ -24,7 +24,7 @@ from transformers import DynamicCache
 from data.interface.effects import Walk
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
-from data.interface.sightings import Seen, Sightings
+from data.interface.sightings import Seen
 from data.interface.steps import PlanStep
 from data.interface.symbolic import events_of
 from proprio_mllm.model.batch import Collator, Example
@@ -32,9 +32,9 @@ from proprio_mllm.model.building import load_model, load_motion
 from proprio_mllm.model.chat import Encoded
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.observing import turn_example
+from proprio_mllm.model.observing import EpisodeLog, turn_example
 from proprio_mllm.model.word_tokens import WordTokens
-from proprio_mllm.model.wording import Words, log_words, prefix_words, read_step, state_words
+from proprio_mllm.model.wording import Words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights
 
@@ -45,37 +45,29 @@ _REFUSALS: Final = 2
 _CHOICES: Final = 4
 
 
-@dataclass(slots=True)
-class WordsState:
-    """One episode.
+@dataclass(slots=True, kw_only=True)
+class WordsState(EpisodeLog):
+    """One episode, as far as it was read.
 
     Attributes:
-        words: the episode's tokens.
         generator: draws the tokens where a temperature asks for it.
-        sightings: what has been seen, and what the log says.
-        log: tokens of prefix and log.
-        cache: keys and values of the first `cached` of them.
+        cache: keys and values of the first `cached` tokens of the log.
         cached: how many.
         refused: how often each step was refused, or walked to where one stood, since the last one that changed something.
     """
 
-    words: WordTokens
     generator: torch.Generator
-    sightings: Sightings = field(default_factory=Sightings)
-    log: list[int] = field(default_factory=list)
     cache: DynamicCache = field(default_factory=DynamicCache)
     cached: int = 0
     refused: dict[str, int] = field(default_factory=dict)
 
     def look(self, observation: Seen) -> list[int]:
-        """Takes in an observation; the tokens of the state, which follow the log."""
-        self.sightings.look(observation)
-        if not self.log:
-            self.log = self.words.tokens(prefix_words(observation))
-        elif observation.history:
-            self.log += self.words.tokens(log_words(observation.history[-1], self.sightings.new))
+        """As the log does; counts what was refused."""
+        begun = bool(self.log)
+        now = EpisodeLog.look(self, observation)
+        if begun and observation.history:
             self._count(observation)
-        return self.words.tokens(state_words(self.sightings))
+        return now
 
     def _count(self, observation: Seen) -> None:
         before, last = [None, *observation.history][-2:]
@@ -123,7 +115,7 @@ class WordsPlanner:
 
     def begin(self, task: TaskInfo, rng: np.random.Generator) -> WordsState:
         """The state of a new episode."""
-        return WordsState(WordTokens(self._tokenizer), torch.Generator().manual_seed(int(rng.integers(2**31))))
+        return WordsState(words=WordTokens(self._tokenizer), generator=torch.Generator().manual_seed(int(rng.integers(2**31))))
 
     def reset(self, task: TaskInfo, rng: np.random.Generator) -> None:
         """Forgets the last episode."""

@@ -16,16 +16,16 @@ from typing import Literal
 import numpy as np
 
 from data.interface.actions import ActionKind
-from data.interface.sightings import Shown, Sightings
+from data.interface.sightings import Shown
 from data.interface.steps import Action, PlanStep
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import use_adapter
 from proprio_mllm.model.chat import Message
 from proprio_mllm.model.modeling import ProprioMLLM
-from proprio_mllm.model.observing import pictured_turn
+from proprio_mllm.model.observing import EpisodeLog, pictured_turn
 from proprio_mllm.model.prompts import Style, answers, critic_prompt, plan_prompt, self_ask_prompt, with_answer
 from proprio_mllm.model.word_tokens import WordTokens
-from proprio_mllm.model.wording import answer_words, log_words, prefix_words, state_words
+from proprio_mllm.model.wording import answer_words
 from proprio_mllm.training.goal_questions import LOG_LENGTH
 from proprio_mllm.training.goals import Relabel, relabel, verbs_of
 from proprio_mllm.training.rollouts import Rollout
@@ -269,21 +269,19 @@ def turn_examples(model: ProprioMLLM, kept: Sequence[Kept]) -> list[Example]:
     examples: list[Example] = []
     for item in kept:
         t, rollout = item.trajectory, item.trajectory.rollout
-        sightings, words, log = Sightings(), WordTokens(model.processor.tokenizer), list[int]()
+        log = EpisodeLog(WordTokens(model.processor.tokenizer))
         for at in range(item.end):
             moment, history = rollout.moments[at], tuple(rollout.history(at))
-            shown = Shown(item.goal, rollout.robot, moment.visible, moment.known, history)
-            sightings.look(shown)
-            log += words.tokens(log_words(history[-1], sightings.new) if history else prefix_words(shown))
+            now = log.look(Shown(item.goal, rollout.robot, moment.visible, moment.known, history))
             served = next((action for later in range(at, item.end) for action in _worked(rollout, later)), None)
             if not moment.ok or served is None or moment.step == "Done()" or _stays(rollout, at):
                 continue
-            target = served.object_id if served.object_id in (None, *moment.known) else None
-            verb, thing = served.name, "" if served.object_id is None else target
-            answer = words.tokens(answer_words(verb, thing, PlanStep.parse(moment.step)))
-            now = words.tokens(state_words(sightings))
+            thing: str | None = served.object_id or ""
+            if thing and thing not in moment.known:
+                thing = None
+            answer = log.words.tokens(answer_words(served.name, thing, PlanStep.parse(moment.step)))
             view = rollout.view(at) if model.cfg.sees else None
-            examples.append(pictured_turn(model, log, now, view, t.motion[at], answer))
+            examples.append(pictured_turn(model, log.log, now, view, t.motion[at], answer))
     return examples
 
 
