@@ -18,10 +18,10 @@ import yaml
 from configs.help import asks_for_help, tool_help
 from configs.validate import ConfigError, allowed_values, build
 
-__all__ = ["announce", "command", "dispatch", "needed_extra", "read_arguments", "read_named"]
+__all__ = ["EXTRAS", "announce", "command", "dispatch", "needed_extra", "read_arguments", "read_named"]
 
 #: Modules that only an extra of pyproject.toml brings.
-_EXTRAS: Final = {
+EXTRAS: Final = {
     "train": (
         "accelerate", "datasets", "jinja2", "peft", "pyarrow", "safetensors", "tokenizers", "torch", "transformers",
         "vector_quantize_pytorch", "wandb",
@@ -132,7 +132,7 @@ def needed_extra(error: ModuleNotFoundError) -> str:
         ModuleNotFoundError: the same, when it is of no extra.
     """
     module = (error.name or "").split(".")[0]
-    extra = next((extra for extra, modules in _EXTRAS.items() if module in modules), None)
+    extra = next((extra for extra, modules in EXTRAS.items() if module in modules), None)
     if extra is None:
         raise error
     return f"needs {module}, which is not installed: pip install 'proprio-mllm[{extra}]', or `make setup` for everything"

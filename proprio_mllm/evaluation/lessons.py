@@ -42,6 +42,7 @@ from proprio_mllm.model.wording import (
 )
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 from proprio_mllm.training.sources import held_out
+from sim.collection.demonstrations import MISTAKES
 from sim.collection.text_planning import draw_task
 from sim.collection.text_world import TextWorld, feedback_text
 from sim.robots.spec import load_robot
@@ -51,8 +52,6 @@ from sim.tasks.sample import TRAIN_ROOMS, rng_for
 
 __all__ = ["Lessons", "WordsOnly"]
 
-#: Shares of steps that are mistakes, one drawn per episode.
-_MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
 _MAX_STEPS: Final = 40
 _RENAMED: Final = 0.5
 _MOST_RENAMED: Final = 5
@@ -131,7 +130,7 @@ class Lessons:
         task = episode.task
         things = dict.fromkeys((*task.objects, *task.objects.values(), *episode.scene.furniture))
         teacher, record = ScriptedPlanner(), _Record(_new_names(tuple(things), set(task.objects), rng))
-        mistakes = float(rng.choice(_MISTAKES))
+        mistakes = float(rng.choice(MISTAKES))
         while episode.steps < _MAX_STEPS:
             shown = episode.shown()
             if world.done():

@@ -34,6 +34,7 @@ from sim.tasks.sample import TRAIN_SEEDS, rng_for, sample_task
 from sim.tasks.task import Task
 
 __all__ = [
+    "MISTAKES",
     "Episode",
     "Student",
     "Teacher",
@@ -71,7 +72,7 @@ _STUDENT_FROM: Final = 500_000
 _LESSONS_FROM: Final = 700_000
 _PRACTICE_FROM: Final = 800_000
 _LESSON_STEPS: Final = 32
-_MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
+MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
 #: How often a drawn family is of each category. Two things for two arms are learnt last.
 _CATEGORY_SHARES: Final = (0.2, 0.5, 0.3)
 
@@ -216,7 +217,7 @@ def run_lesson(
     sessions, number = {} if sessions is None else sessions, (_LESSONS_FROM if student is None else _PRACTICE_FROM) + index
     robot, task, session, observation = _start(config, number, rng, sessions, family=family)
     session.step_limit = _LESSON_STEPS
-    mistakes = float(rng.choice(_MISTAKES))
+    mistakes = float(rng.choice(MISTAKES))
     episode = Episode()
     done = PlanStep((Action("Done"),))
     while not session.finished:

@@ -21,7 +21,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
-from configs.arguments import command, read_arguments
+from configs.arguments import EXTRAS, command, read_arguments
 from data.files import cache_folder
 
 __all__ = ["CHECKS", "Finding", "main"]
@@ -32,8 +32,6 @@ _PATIENCE_S: Final = 20
 _MEMORY_GB: Final = 4
 #: Of each backend, the library and the system packages that bring it.
 _LIBRARIES: Final = {"egl": ("EGL", "libegl1 libgl1-mesa-dri"), "osmesa": ("OSMesa", "libosmesa6")}
-#: Extras that commands of this repository need.
-_EXTRAS: Final = ("train", "llm")
 _DRAW: Final = """
 import mujoco
 context = mujoco.GLContext(16, 16)
@@ -72,7 +70,7 @@ def _packages() -> Finding:
         return Finding("no requirements.lock and pyproject.toml here, nothing is compared")
     pins = dict(re.findall(r"^([\w.-]+)==([^\s;]+)", lock.read_text(encoding="utf-8"), re.MULTILINE))
     asked = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
-    groups = {"": asked["dependencies"]} | {name: asked["optional-dependencies"][name] for name in _EXTRAS}
+    groups = {"": asked["dependencies"]} | {name: asked["optional-dependencies"][name] for name in EXTRAS}
     absent = {group: [name for name in map(_name, wanted) if _version(name) is None] for group, wanted in groups.items()}
     if absent[""]:
         return Finding(f"missing: {', '.join(absent[''])}", "run `make setup`", True)
@@ -80,7 +78,7 @@ def _packages() -> Finding:
     others = [f"{name} {found} (pinned {pins[name]})" for name, found in here.items() if found != pins[name]]
     if others:
         return Finding(f"other versions: {', '.join(others)}", "run `make setup` for the tested ones")
-    without = [name for name in _EXTRAS if absent[name]]
+    without = [name for name in EXTRAS if absent[name]]
     return Finding(f"{len(here)} as pinned{', without the extras ' + ' and '.join(without) if without else ''}")
 
 

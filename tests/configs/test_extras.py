@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from configs.arguments import _EXTRAS, needed_extra
+from configs.arguments import EXTRAS, needed_extra
 
 ROOT = Path(__file__).parents[2]
 
@@ -23,7 +23,7 @@ def test_a_missing_module_is_named_with_its_extra() -> None:
 
 def test_every_package_of_an_extra_has_its_module_listed() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    for extra, modules in _EXTRAS.items():
+    for extra, modules in EXTRAS.items():
         packages = {re.split("[<>=]", one)[0].replace("-", "_") for one in extras[extra]} - {"torch"}
         assert packages <= set(modules) | {"torch"}
 
@@ -50,7 +50,7 @@ out = "output={folder}"
     ],
 )
 def test_simulator_and_rules_do_without_extras(code: str, tmp_path: Path) -> None:
-    done = ran_without(sorted({module for modules in _EXTRAS.values() for module in modules}), code, tmp_path)
+    done = ran_without(sorted({module for modules in EXTRAS.values() for module in modules}), code, tmp_path)
     assert done.returncode == 0, done.stderr[-2000:]
 
 

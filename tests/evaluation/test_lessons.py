@@ -79,7 +79,7 @@ def _step(answer: Sequence[str]) -> tuple[str, ...]:
 
 def test_mistakes_are_taken_and_never_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
     mistake = PlanStep.parse("RotateLeft(5)")
-    monkeypatch.setattr(lessons, "_MISTAKES", (0.5,))
+    monkeypatch.setattr(lessons, "MISTAKES", (0.5,))
     monkeypatch.setattr(TextWorld, "mistake", lambda self, step: mistake)
     words = answer_words("Pick", None, mistake)[3:-1]
     turns = [turn for seed in range(12) for turn in Lessons().episode(seed).turns]
