@@ -18,7 +18,7 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import plan_prompt, with_answer
 from proprio_mllm.model.vocabulary import motion_text
-from proprio_mllm.model.word_tokens import WordTokens
+from proprio_mllm.model.word_tokens import Tokens, opening
 from proprio_mllm.model.wording import log_words, prefix_words, state_words
 
 __all__ = ["EpisodeLog", "motion_codes", "pictured_turn", "plan_example", "turn_example", "view_of"]
@@ -34,7 +34,7 @@ class EpisodeLog:
         log: tokens of prefix and log.
     """
 
-    words: WordTokens
+    words: Tokens
     sightings: Sightings = field(default_factory=Sightings)
     log: list[int] = field(default_factory=list)
 
@@ -135,7 +135,8 @@ def pictured_turn(
     if view is not None:
         text = IMAGE + (motion_text(codes) if codes is not None else "")
         sight = model.processor.tokenizer(text, add_special_tokens=False)["input_ids"]
-        tokens = [*log, *now[:-1], *sight, now[-1]]
+        before = len(now) - opening(model.processor.tokenizer)
+        tokens = [*log, *now[:before], *sight, *now[before:]]
     learnt = [False] * len(tokens) + [True] * len(answer)
     encoded = Encoded(tuple([*tokens, *answer][read:]), tuple(learnt[read:]))
     return Example(views=() if view is None else (view,), tokens=encoded, start=read)

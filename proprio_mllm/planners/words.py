@@ -33,7 +33,7 @@ from proprio_mllm.model.chat import Encoded
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.observing import EpisodeLog, turn_example
-from proprio_mllm.model.word_tokens import WordTokens
+from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import Words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights
@@ -115,7 +115,7 @@ class WordsPlanner:
 
     def begin(self, task: TaskInfo, rng: np.random.Generator) -> WordsState:
         """The state of a new episode."""
-        return WordsState(words=WordTokens(self._tokenizer), generator=torch.Generator().manual_seed(int(rng.integers(2**31))))
+        return WordsState(words=tokens_of(self._tokenizer), generator=torch.Generator().manual_seed(int(rng.integers(2**31))))
 
     def reset(self, task: TaskInfo, rng: np.random.Generator) -> None:
         """Forgets the last episode."""
@@ -175,14 +175,15 @@ def plans_in_words(folder: str | Path) -> bool:
 
 
 class _Answer:
-    """An answer under way: its words and tokens, and what else was likely at each of them."""
+    """An answer under way: its words and their tokens, how sure each was, and the tokens of the word that is being written."""
 
     def __init__(self, grammar: AnswerGrammar, state: WordsState, turn: Example) -> None:
         self._grammar, self.state, self._turn = grammar, state, turn
         self.words: list[str] = []
         self._tokens: list[list[int]] = []
-        self._rest: list[int] = []
         self._margins: list[float] = []
+        self._begun: list[int] = []
+        self._margin = float("inf")
         self._forbidden: dict[Words, set[str]] = {}
 
     @property
@@ -192,7 +193,7 @@ class _Answer:
 
     def begun(self) -> list[int]:
         """Its tokens so far."""
-        return [token for tokens in self._tokens for token in tokens]
+        return [token for tokens in (*self._tokens, self._begun) for token in tokens]
 
     def example(self, read: int) -> Example:
         """What stands before it and its tokens so far, without the first tokens."""
@@ -201,28 +202,48 @@ class _Answer:
         return replace(self._turn, tokens=Encoded(ids, (False,) * len(ids)), start=read)
 
     def choose(self, scores: Tensor, temperature: float) -> int | None:
-        """Takes the next word by the scores (V,) of tokens.
+        """Takes the next token by the scores (V,) of tokens; None when the answer has ended.
 
-        Returns:
-            Its first token, or the next one of a word under way; None when the answer has ended.
+        Words may be of several tokens, and one may begin as another does (`_1` and `_10`): such a word ends with the first
+        token of the word that follows it.
         """
-        if self._rest:
-            return self._rest.pop(0)
-        options = [word for word in self._grammar.allowed(self.words) if word not in self._forbidden.get(tuple(self.words), ())]
-        if not options:
+        spelt = self._options(self.words)
+        size = len(self._begun)
+        live = {word: tokens for word, tokens in spelt.items() if tokens[:size] == self._begun}
+        ended = next((word for word, tokens in live.items() if len(tokens) == size), None)
+        after = {} if ended is None else self._options([*self.words, ended])
+        longer = dict.fromkeys(tokens[size] for tokens in live.values() if len(tokens) > size)
+        tokens = list(longer | dict.fromkeys(spelling[0] for spelling in after.values()))
+        if not tokens:
             return None
-        tokens = [self.state.words.tokens([word]) for word in options]
-        values = scores[[first for first, *_ in tokens]]
+        values = scores[tokens]
         if temperature > 0.0:
             index = int(torch.multinomial((values / temperature).softmax(-1), 1, generator=self.state.generator))
         else:
             index = int(values.argmax())
-        others = values[torch.arange(len(options)) != index]
-        self._margins.append(float(values[index] - others.max()) if len(options) > 1 else float("inf"))
-        self.words.append(options[index])
-        self._tokens.append(tokens[index])
-        first, *self._rest = tokens[index]
-        return first
+        if len(tokens) > 1:
+            self._margin = min(self._margin, float(values[index] - values[torch.arange(len(tokens)) != index].max()))
+        token = tokens[index]
+        if token not in longer:
+            assert ended is not None
+            self._close(ended)
+            live, size = after, 0
+        self._begun.append(token)
+        live = {word: spelling for word, spelling in live.items() if spelling[: size + 1] == self._begun}
+        if len(live) == 1 and len(next(iter(live.values()))) == size + 1:
+            self._close(next(iter(live)))
+        return token
+
+    def _options(self, words: Sequence[str]) -> dict[str, list[int]]:
+        """Spelling of every word that may follow."""
+        forbidden = self._forbidden.get(tuple(words), ())
+        return {word: self.state.words.tokens([word]) for word in self._grammar.allowed(words) if word not in forbidden}
+
+    def _close(self, word: str) -> None:
+        self.words.append(word)
+        self._tokens.append(self._begun)
+        self._margins.append(self._margin)
+        self._begun, self._margin = [], float("inf")
 
     def step(self) -> PlanStep:
         """The step of a finished answer."""

@@ -24,7 +24,7 @@ from proprio_mllm.model.chat import Message
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.observing import EpisodeLog, pictured_turn
 from proprio_mllm.model.prompts import Style, answers, critic_prompt, plan_prompt, self_ask_prompt, with_answer
-from proprio_mllm.model.word_tokens import WordTokens
+from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import answer_words
 from proprio_mllm.training.goal_questions import LOG_LENGTH
 from proprio_mllm.training.goals import Relabel, relabel, verbs_of
@@ -269,7 +269,7 @@ def turn_examples(model: ProprioMLLM, kept: Sequence[Kept]) -> list[Example]:
     examples: list[Example] = []
     for item in kept:
         t, rollout = item.trajectory, item.trajectory.rollout
-        log = EpisodeLog(WordTokens(model.processor.tokenizer))
+        log = EpisodeLog(tokens_of(model.processor.tokenizer))
         for at in range(item.end):
             moment, history = rollout.moments[at], tuple(rollout.history(at))
             now = log.look(Shown(item.goal, rollout.robot, moment.visible, moment.known, history))

@@ -210,6 +210,13 @@ class Pipeline:
         logger.info("%s: %s", name, ", ".join(f"{k} {v:.4g}" for k, v in metrics.items()))
         return metrics
 
+    def needs_no(self, stage: str) -> bool:
+        """Whether pretrained weights stand in for a stage's output; says so."""
+        given = self.cfg.model.weights is not None
+        if given:
+            logger.info("%s: %s has pretrained weights, nothing to do", stage, self.cfg.model.name)
+        return given
+
     def loop(self, objective: Objective, cfg: LoopConfig, folder: Path) -> None:
         """Runs one objective with this configuration's seed and logger."""
         folder.mkdir(parents=True, exist_ok=True)

@@ -18,14 +18,12 @@ from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.observing import pictured_turn
-from proprio_mllm.model.word_tokens import WordTokens
+from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.sources import Demos
+from proprio_mllm.training.words import LONGEST_LOG
 
 __all__ = ["Turns", "turn_accuracy"]
-
-#: Longest log, tokens; what is longer is left out, as in stage `words`.
-_LONGEST = 320
 
 
 class Turns:
@@ -58,10 +56,10 @@ class Turns:
         starts = [row for row, name in enumerate(names) if row == 0 or name != names[row - 1]]
         episodes = [episode for folder in folders for episode in told(folder)]
         for start, episode in zip(starts, episodes, strict=True):
-            words = WordTokens(model.processor.tokenizer)
+            words = tokens_of(model.processor.tokenizer)
             log = words.tokens(episode.prefix)
             for number, turn in enumerate(episode.turns):
-                if len(log) <= _LONGEST:
+                if len(log) <= LONGEST_LOG * words.length:  # as in stage `words`
                     self._told[start + number] = (list(log), words.tokens(turn.now), words.tokens(turn.answer))
                 log += words.tokens(turn.taken)
         rows = np.array(sorted(self._told), dtype=np.int64)

@@ -20,34 +20,47 @@ from torch.nn import functional
 from proprio_mllm.model.batch import IGNORE, Movable
 from proprio_mllm.model.branches import Branches, read_branches
 from proprio_mllm.model.modeling import ProprioMLLM
-from proprio_mllm.model.word_tokens import WordTokens, first_word
+from proprio_mllm.model.word_tokens import Tokens, first_word, tokens_of
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.loop import Parts
 
-__all__ = ["Source", "WordBatch", "WordsObjective", "collate", "held_out_metrics", "mixed", "rows_of", "words_loss"]
+__all__ = [
+    "LONGEST_LOG",
+    "Source",
+    "WordBatch",
+    "WordsObjective",
+    "collate",
+    "held_out_metrics",
+    "mixed",
+    "rows_of",
+    "words_loss",
+]
 
 #: The episode of a seed.
 Source = Callable[[int], WordEpisode]
 #: Decisions of a row, and rows that are computed together.
 _TURNS: Final = 6
 _ROWS: Final = 8
-#: Lengths of logs and of branches, tokens. Few lengths: kernels are prepared anew for every shape. What is longer is left out.
+#: Lengths of logs and of branches, words. Few lengths: kernels are prepared anew for every shape. What is longer is left out.
 _LOGS: Final = (128, 320)
 _BRANCHES: Final = (48, 96)
+#: Longest log, words.
+LONGEST_LOG: Final = _LOGS[-1]
 
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """Decisions of one episode: the log's tokens, and (anchor, tokens, first token of the answer) of each branch."""
+    """Decisions of one episode: the log's tokens, (anchor, tokens, first token of the answer) of each branch, tokens a word."""
 
     log: list[int]
     branches: list[tuple[int, list[int], int]]
+    length: float
 
     @property
     def shape(self) -> tuple[int, int]:
         """Lengths of the log and of a branch, padded."""
         width = max(len(tokens) for _, tokens, _ in self.branches)
-        return _bucket(len(self.log), _LOGS), _bucket(width, _BRANCHES)
+        return _bucket(len(self.log), _LOGS, self.length), _bucket(width, _BRANCHES, self.length)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,22 +86,22 @@ class WordBatch(Movable):
     parts: int = 1
 
 
-def rows_of(episode: WordEpisode, words: WordTokens) -> list[_Row]:
+def rows_of(episode: WordEpisode, words: Tokens) -> list[_Row]:
     """An episode's rows, each of some decisions of similar length."""
     log = words.tokens(episode.prefix)
     branches: list[tuple[int, list[int], int]] = []
     for turn in episode.turns:
         now = words.tokens(turn.now)
         tokens = [*now, *words.tokens(turn.answer)]
-        if turn.answer and len(tokens) <= _BRANCHES[-1] and len(log) <= _LOGS[-1]:
+        if turn.answer and len(tokens) <= _BRANCHES[-1] * words.length and len(log) <= LONGEST_LOG * words.length:
             branches.append((len(log), tokens, len(now)))
         log += words.tokens(turn.taken)
     rows: list[_Row] = []
     for low, high in pairwise((0, *_BRANCHES)):
-        same = [branch for branch in branches if low < len(branch[1]) <= high]
+        same = [branch for branch in branches if low < len(branch[1]) / words.length <= high]
         count = -(-len(same) // _TURNS)
         cuts = [len(same) * row // count for row in range(count + 1)] if count else [0]
-        rows += [_Row(log[: same[end - 1][0]], same[first:end]) for first, end in pairwise(cuts)]
+        rows += [_Row(log[: same[end - 1][0]], same[first:end], words.length) for first, end in pairwise(cuts)]
     return rows
 
 
@@ -113,8 +126,8 @@ def collate(rows: Sequence[_Row], pad: int) -> WordBatch:
     return WordBatch(torch.from_numpy(ids), torch.from_numpy(places), torch.from_numpy(labels), layout)
 
 
-def _bucket(size: int, sizes: Sequence[int]) -> int:
-    return next(one for one in sizes if one >= size)
+def _bucket(size: int, sizes: Sequence[int], length: float) -> int:
+    return next(tokens for one in sizes if (tokens := round(one * length)) >= size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +217,7 @@ class WordsObjective:
         rows: list[_Row] = []
         for _ in range(size):
             episode = self._episode(int(rng.integers(2**62)))
-            rows += rows_of(episode, WordTokens(self.model.processor.tokenizer, rng))
+            rows += rows_of(episode, tokens_of(self.model.processor.tokenizer, rng))
         shapes: dict[tuple[int, int], list[_Row]] = {}
         for row in rows:
             shapes.setdefault(row.shape, []).append(row)

@@ -31,7 +31,7 @@ from proprio_mllm.training.pipeline import base_model_config
 INFO = TaskInfo("", "h1", 20)
 
 
-def small(sees: bool = False) -> WordsPlanner:
+def small(sees: bool = False, english: bool = False) -> WordsPlanner:
     whole = build(TrainConfig, compose("train", ["stage=words"])).model
     cfg = whole if sees else base_model_config(whole)
     text = dataclasses.replace(cfg.text, hidden=64, layers=2, heads=2, kv_heads=1, intermediate=96)
@@ -48,7 +48,8 @@ def small(sees: bool = False) -> WordsPlanner:
     )
     words = Lessons().words()
     processor = build_processor(cfg, [" ".join(words)] * 2)
-    add_word_tokens(processor.tokenizer, words)
+    if not english:
+        add_word_tokens(processor.tokenizer, words)
     motion = MotionTokenizer(motion_cfg).eval() if sees else None
     return WordsPlanner(build_model(cfg, processor, 3).eval(), motion)
 
@@ -61,6 +62,12 @@ def planner() -> WordsPlanner:
 @pytest.fixture(scope="module")
 def seeing() -> WordsPlanner:
     return small(sees=True)
+
+
+@pytest.fixture(scope="module")
+def spelling() -> WordsPlanner:
+    """One whose tokenizer spells words."""
+    return small(english=True)
 
 
 def seen(shown: Shown, seed: int) -> Observation:
@@ -77,7 +84,9 @@ def begin(planner: WordsPlanner, seed: int = 0):
     return planner.begin(INFO, np.random.default_rng(seed))
 
 
-def test_side_by_side_as_alone(planner: WordsPlanner) -> None:
+@pytest.mark.parametrize("which", ["planner", "spelling"])
+def test_side_by_side_as_alone(which: str, request: pytest.FixtureRequest) -> None:
+    planner: WordsPlanner = request.getfixturevalue(which)
     together, alone = ([WordsOnly(seed) for seed in range(4)] for _ in range(2))
     states, own = ([begin(planner) for _ in range(4)] for _ in range(2))
     for _ in range(5):
@@ -215,6 +224,31 @@ def test_names_that_end_like_plurals_are_written_as_they_are_read(planner: Words
         written.append(token)
     assert written == expected == answer.begun()
     assert answer.step() == PlanStep.parse("GoTo(Zubos_1)")
+
+
+def test_a_name_that_begins_as_another_does_is_spelt_to_its_end(spelling: WordsPlanner) -> None:
+    shown = Shown("put the mug on the bed", "h1", (), ("Mug_1", "Mug_10", "Mug_11", "Bed_1"))
+    for wanted in ("Mug_1", "Mug_10", "Mug_11", "Bed_1"):
+        state = begin(spelling)
+        answer = _Answer(AnswerGrammar(shown.known_objects), state, turn_example(spelling.model, [], state.look(shown), None))
+        words = answer_words("GoTo", wanted, PlanStep.parse(f"GoTo({wanted})"))
+        expected, written = state.words.tokens(words), list[int]()
+        assert len(expected) > len(words)
+        scores = torch.eye(len(spelling.model.processor.tokenizer))
+        while (token := answer.choose(scores[expected[min(len(written), len(expected) - 1)]], 0.0)) is not None:
+            written.append(token)
+        assert written == expected == answer.begun()
+        assert tuple(answer.words) == words
+        assert answer.step() == PlanStep.parse(f"GoTo({wanted})")
+
+
+def test_a_pretrained_tokenizer_reads_english(spelling: WordsPlanner) -> None:
+    state = begin(spelling)
+    now = state.look(Shown("put the mug on the bed", "h1", ("Mug_1",), ("Mug_1", "SideTable_12")))
+    text = spelling.model.processor.tokenizer.decode([*state.log, *now])
+    assert text == (
+        " h1 put the mug on the bed\nIn the room: mug_1 side table_12\nNow: left empty right empty away; in view: mug_1\nDo:"
+    )
 
 
 def test_refusals_are_counted_until_something_succeeds(planner: WordsPlanner) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
 from pathlib import Path
 
@@ -14,13 +15,13 @@ from configs.compose import compose
 from configs.schema.train import TrainConfig
 from configs.validate import build
 from proprio_mllm.evaluation.lessons import Lessons
-from proprio_mllm.model.building import load_model
+from proprio_mllm.model.building import build_model, build_processor, load_model, save_model
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.word_tokens import WordTokens
 from proprio_mllm.planners.words import plans_in_words
 from proprio_mllm.training.critic import Kept, Trajectory, turn_examples
-from proprio_mllm.training.pipeline import Pipeline
+from proprio_mllm.training.pipeline import Pipeline, base_model_config
 from proprio_mllm.training.rollouts import read_rollouts
 from proprio_mllm.training.stages import stages_of
 from proprio_mllm.training.stages.inputs import episodes_in_words, lesson_folders, lessons_of, turns_of
@@ -83,6 +84,28 @@ def test_episodes_in_words_are_learnt_through_the_adapter(trained: Pipeline) -> 
     moved = [float(p.grad.abs().sum()) for p in model.parameters() if p.grad is not None]
     assert moved
     assert max(moved) > 0.0
+
+
+def test_pretrained_weights_read_episodes_as_english(trained: Pipeline, tmp_path: Path) -> None:
+    cfg = base_model_config(trained.cfg.model)
+    processor = build_processor(cfg, [" ".join(Lessons().words())] * 2)
+    save_model(build_model(cfg, processor, 0), tmp_path / "given")
+    weights = tmp_path / "given" / "vlm"
+    shutil.copytree(tmp_path / "given" / "processor", weights, dirs_exist_ok=True)
+    shutil.copytree(trained.paths.root / "data", tmp_path / "tiny" / "data")
+    shutil.rmtree(tmp_path / "tiny" / "data" / "practice")
+    model = dataclasses.replace(trained.cfg.model, weights=str(weights))
+    given = dataclasses.replace(trained.cfg, output=str(tmp_path), model=model)
+    pipeline = Pipeline(stages_of(model), given, collect, "", None, Lessons())
+    done = {stage: pipeline.run(stage) for stage in pipeline.stages}
+    assert all(set(done[name] or ()) == {"seconds"} for name in ("words", "practice", "base"))
+    assert (done["alignment"] or {})["turns"] > 0
+    made, motion = load_model(pipeline.paths.model("selu")), MotionTokenizer.load(pipeline.paths.model("tokenizer"))
+    turns = turns_of(pipeline, made, lessons_of(pipeline, made.cfg), motion)
+    example = turns.example(int(turns.train[0]))
+    assert example.tokens is not None
+    text = made.processor.tokenizer.decode(example.tokens.ids)
+    assert re.search(r"\nNow: left empty right empty .*<\|image_pad\|>.*<motion_end>\nDo: \w+ [\w ]+\nDo: \w+", text)
 
 
 def test_hindsight_names_the_sub_goal(trained: Pipeline) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -30,8 +29,6 @@ from proprio_mllm.training.words import held_out_metrics
 
 __all__ = ["BaseStage", "EpisodeBaseStage"]
 
-logger = logging.getLogger(__name__)
-
 
 class BaseStage:
     """Dense grounding first, then grounding, planning and text together, all weights training."""
@@ -50,8 +47,7 @@ class BaseStage:
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
         """Trains and stores the base model; nothing to do where pretrained weights are given."""
         cfg, plain = pipeline.cfg, base_model_config(pipeline.cfg.model)
-        if cfg.model.weights is not None:
-            logger.info("base: %s has pretrained weights, nothing to do", cfg.model.name)
+        if pipeline.needs_no(self.name):
             return {}
         views, demos = Views(pipeline.paths.shards("views"), plain), Demos(pipeline.paths.shards("demos"), plain)
         clips = Clips(pipeline.paths.shards("clips"))
@@ -82,8 +78,10 @@ class EpisodeBaseStage(BaseStage):
     recipe = 0
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
-        """Trains and stores the base model."""
+        """Trains and stores the base model; nothing to do where pretrained weights are given."""
         cfg, lessons = pipeline.cfg, pipeline.lessons
+        if pipeline.needs_no(self.name):
+            return {}
         if lessons is None:
             raise StageError("stage 'base' needs lessons: run it with `python train.py stage=base`")
         plain = dataclasses.replace(base_model_config(cfg.model), episodes=True, sees=True)

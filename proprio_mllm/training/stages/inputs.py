@@ -46,8 +46,9 @@ def text_rows(pipeline: Pipeline, model: ModelConfig, demos: Demos) -> TextPlann
 
 
 def lesson_folders(pipeline: Pipeline) -> list[Path]:
-    """Shards of episodes in the simulator: the teacher's, and those in which the words model acted."""
-    return [pipeline.paths.shards(name) for name in ("lessons", "practice")]
+    """Shards of episodes in the simulator: the teacher's, and those in which the words model acted where there is one."""
+    names = ("lessons", "practice") if pipeline.cfg.model.weights is None else ("lessons",)
+    return [pipeline.paths.shards(name) for name in names]
 
 
 def lessons_of(pipeline: Pipeline, model: ModelConfig) -> Demos:
@@ -65,8 +66,8 @@ def episodes_in_words(pipeline: Pipeline, model: ProprioMLLM, key: str) -> Words
     lessons, cfg = pipeline.lessons, pipeline.cfg.practice
     if lessons is None:
         raise StageError("no source of lessons was given; run the stage with `python train.py`")
-    taught, own = (lessons.logged(folder) for folder in lesson_folders(pipeline))
-    return WordsObjective(model, mixed(lessons.episode, (cfg.own_share, own), (cfg.logged, taught)), key)
+    shares = zip((cfg.logged, cfg.own_share), map(lessons.logged, lesson_folders(pipeline)), strict=False)
+    return WordsObjective(model, mixed(lessons.episode, *shares), key)
 
 
 def turns_of(pipeline: Pipeline, model: ProprioMLLM, demos: Demos, tokens: MotionTokenizer | None = None) -> Turns:

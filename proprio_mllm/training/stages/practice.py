@@ -33,7 +33,12 @@ class PracticeStage:
         return {"practice": dataclasses.asdict(pipeline.cfg.practice)}
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
-        """Lets the model act, trains it and stores it; measures it on episodes that it was not trained on."""
+        """Lets the model act, trains it and stores it; measures it on episodes that it was not trained on.
+
+        Pretrained weights need none of it.
+        """
+        if pipeline.needs_no(self.name):
+            return {}
         lessons, cfg, student = pipeline.lessons, pipeline.cfg.practice, pipeline.paths.model("words")
         if lessons is None or pipeline.collect_dagger is None:
             raise StageError("stage 'practice' needs lessons and the simulator: run it with `python train.py stage=practice`")

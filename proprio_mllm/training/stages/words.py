@@ -29,7 +29,12 @@ class WordsStage:
         return {"words": dataclasses.asdict(pipeline.cfg.words), "model": dataclasses.asdict(_plain(pipeline.cfg.model))}
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
-        """Trains and stores the model; measures it on episodes that it was not trained on."""
+        """Trains and stores the model; measures it on episodes that it was not trained on.
+
+        Pretrained weights need none of it.
+        """
+        if pipeline.needs_no(self.name):
+            return {}
         lessons, share = pipeline.lessons, pipeline.cfg.words.logged
         if lessons is None:
             raise StageError("stage 'words' needs a source of lessons: run it with `python train.py stage=words`")
