@@ -1,8 +1,8 @@
 """Trains Proprio-MLLM: `python train.py stage=all model=tiny` (paper, three stages; `stage=base` stands in for pretraining).
 
-Stages: data (motions to clips shards), collect (views, planning in words, demonstrations, lessons), base, dagger (the base
-model acts, the expert corrects it), pointmap, tokenizer, alignment, selu; `all` runs them in order and skips what is current.
-`words` (whole episodes in words) and `practice` (more, from acting) are run by name. Options: configs/schema/train.py.
+Stages: data (motions to clips shards), collect (views, lessons), words (whole episodes in words), practice (more, from
+acting), base, pointmap, tokenizer, alignment, selu; `all` runs them in order and skips what is current. Options:
+configs/schema/train.py.
 """
 
 from __future__ import annotations
@@ -36,25 +36,15 @@ def make_data(cfg: TrainConfig) -> None:
 
 
 def make_shards(cfg: TrainConfig) -> None:
-    """Posed views, exercises in words, the expert's demonstrations and the rules' lessons on training tasks.
-
-    Where whole episodes are read, views and lessons alone.
-    """
+    """Posed views, and the rules' lessons on training tasks."""
     from configs.schema.collect import CollectConfig as ShardConfig
     from proprio_mllm.evaluation.dagger import collect_lessons
     from proprio_mllm.training.paths import StagePaths
     from sim.collection.collect import collect
 
-    kinds: tuple[tuple[str, Literal["views", "text_planning", "goal_questions", "demos"], int, int], ...]
-    kinds = (
-        ("views", "views", cfg.collect.views, 240),
-        ("text_planning", "text_planning", cfg.collect.text_planning, 1000),
-        ("goal_questions", "goal_questions", cfg.collect.text_planning, 1000),
-        ("demos", "demos", cfg.collect.episodes, 10),
-        ("lessons", "demos", cfg.collect.lessons, 10),
-    )
-    wanted = [one for one in kinds if one[0] in ("views", "lessons")] if cfg.model.episodes else kinds
-    for name, kind, count, part in wanted:
+    kinds: tuple[tuple[str, Literal["views", "demos"], int, int], ...]
+    kinds = (("views", "views", cfg.collect.views, 240), ("lessons", "demos", cfg.collect.lessons, 10))
+    for name, kind, count, part in kinds:
         shards = ShardConfig(
             kind=kind, out=str(StagePaths(cfg).shards(name)), count=count, seed=cfg.seed, image_size=cfg.model.image_size,
             part_size=part, workers=cfg.collect.workers, robots=cfg.data.robots,
@@ -89,21 +79,16 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
 
     from proprio_mllm.evaluation.lessons import Lessons
     from proprio_mllm.training.pipeline import Pipeline, StageError
-    from proprio_mllm.training.stages import stages_of
+    from proprio_mllm.training.stages import STAGES
 
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
     command = " ".join(["python train.py", *sys.argv[1:]])
     robots = cfg.data.robots
-    stages = stages_of(cfg.model)
     pipeline = Pipeline(
-        stages, cfg, partial(_rollouts, robots=robots), command, partial(_dagger, robots=robots), Lessons(robots)
+        STAGES, cfg, partial(_rollouts, robots=robots), command, partial(_dagger, robots=robots), Lessons(robots)
     )
-    wanted = (
-        tuple(name for name in stages if cfg.model.episodes or name not in ("words", "practice"))
-        if cfg.stage == "all"
-        else (cfg.stage,)
-    )
+    wanted = tuple(STAGES) if cfg.stage == "all" else (cfg.stage,)
     metrics = {name: pipeline.run(name) for name in wanted}
     if cfg.release is not None:
         from proprio_mllm.training.release import export
@@ -123,7 +108,7 @@ def _rollouts(*args: Any, **kwargs: Any) -> Any:
 
 
 def _dagger(*args: Any, **kwargs: Any) -> Any:
-    """The base model acts in the simulator and the expert corrects it; training reads the shards."""
+    """The words model acts in the simulator and its teacher corrects it; training reads the shards."""
     from proprio_mllm.evaluation.dagger import collect_dagger
 
     return collect_dagger(*args, **kwargs)

@@ -1,9 +1,9 @@
 """Columns of each kind of shard; changing them means a new `data.shards.SCHEMA_VERSION`.
 
 Paper: none (engineering). `views`: posed views with truth for the point map and dense pretraining. `clips`: motion with
-captions and replayed views, stage 2. `demos`: expert steps. `text_planning`: steps in words alone, `goal_questions`: was it
-done. `rollouts`: SELU's trajectories, one row per episode, stage 3; images, motions and cameras have one entry per step and one
-for the end. `privileged` is for audits only: no loss or prompt may read it.
+captions and replayed views, stage 2. `demos`: steps of a teacher. `rollouts`: SELU's trajectories, one row per episode, stage
+3; images, motions and cameras have one entry per step and one for the end. `privileged` is for audits only: no loss or prompt
+may read it.
 """
 
 from __future__ import annotations
@@ -22,19 +22,6 @@ def _list(of: Any) -> Any:
     return datasets.List(of)
 
 
-#: A planning prompt without a picture, the ids that its instruction names, and its answer.
-_IN_WORDS: Final[Mapping[str, Any]] = {
-    "instruction": _TEXT,
-    "robot": _TEXT,
-    "category": _TEXT,
-    "step": _INT,
-    "time_limit": _INT,
-    "visible": _list(_TEXT),
-    "known": _list(_TEXT),
-    "history": _list({"step": _TEXT, "feedback": _TEXT}),
-    "named": _list(_TEXT),
-    "target": _TEXT,
-}
 #: Columns of each kind. Motions are flat (T·F,) float32; `decode_motion` restores them.
 KINDS: Final[Mapping[str, Mapping[str, Any]]] = {
     "views": {
@@ -90,8 +77,6 @@ KINDS: Final[Mapping[str, Mapping[str, Any]]] = {
         "target": _TEXT,
         "privileged": _TEXT,
     },
-    "text_planning": _IN_WORDS,
-    "goal_questions": _IN_WORDS,
     "rollouts": {
         "episode": _TEXT,
         "task": _TEXT,

@@ -13,8 +13,7 @@ class CollectConfig:
     """What is collected, how much, and where it goes.
 
     Attributes:
-        kind: `views` (posed views), `demos` (expert steps), `text_planning` (steps in words alone) or `goal_questions` (was it
-            done, in words alone).
+        kind: `views` (posed views) or `demos` (expert steps).
         out: shard folder.
         count: views, or episodes.
         robots: robots in turn.
@@ -28,7 +27,7 @@ class CollectConfig:
         medium_share: demos: share of episodes at medium difficulty, so that recoveries appear.
     """
 
-    kind: Literal["views", "demos", "text_planning", "goal_questions"]
+    kind: Literal["views", "demos"]
     out: str
     count: int
     robots: tuple[str, ...] = ("h1", "x1")

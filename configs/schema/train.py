@@ -13,7 +13,6 @@ __all__ = [
     "AlignmentConfig",
     "BaseConfig",
     "CollectStageConfig",
-    "DaggerConfig",
     "LoggerConfig",
     "LoopConfig",
     "PracticeConfig",
@@ -26,9 +25,7 @@ __all__ = [
 
 #: Training tasks have 2^31 seeds, a million for each seed of a run.
 LARGEST_SEED = 2000
-StageName = Literal[
-    "all", "data", "collect", "words", "practice", "base", "dagger", "pointmap", "tokenizer", "alignment", "selu"
-]
+StageName = Literal["all", "data", "collect", "words", "practice", "base", "pointmap", "tokenizer", "alignment", "selu"]
 Variant = Literal["full", "no_mpe", "no_cse", "no_mpe_cse", "no_proprio"]
 
 
@@ -89,9 +86,10 @@ class BaseConfig:
         dense: loop of the dense, name-tied pretraining of the vision tower.
         joint: loop of the mixed batches.
         questions: question and answer pairs packed per image.
-        plan_share: share of the joint batches that are planning demonstrations or exercises.
-        text_share: share of exercises in text alone among them.
-        judge_share: share of judging questions among the planning demonstrations.
+        plan_share: share of the joint batches that are of episodes: decisions with pictures, episodes in words, judging
+            questions.
+        text_share: share of episodes in words among them.
+        judge_share: share of judging questions and phrases among the others.
         dense_weight: weight of the dense loss on the joint batches' views.
     """
 
@@ -160,9 +158,9 @@ class AlignmentConfig:
         text: loop of phase 2a-i, motion and text; vision and CSE frozen.
         image: loop of phase 2a-ii, motion and image; the language model's LoRA frozen.
         joint: loop of phase 2b; rows, LoRA, CSE and merger train.
-        plan_share: share of the joint batches that are planning demonstrations with proprioception, or exercises.
-        text_share: share of exercises without pictures among them.
-        judge_share: share of judging questions among the planning demonstrations, and among the exercises.
+        plan_share: share of the joint batches that are of episodes: decisions with pictures and motion, episodes in words.
+        text_share: share of episodes in words among them.
+        judge_share: share of judging questions among the decisions.
         questions: body-relative questions packed per image.
         mask: share of motion tokens hidden in masked motion.
     """
@@ -192,8 +190,8 @@ class SeluConfig:
         critic: loop of the critic's fine-tuning.
         actor: loop of the actor's fine-tuning.
         truth: `audit` only reports the critic against the simulator; `oracle` lets the simulator judge (a labelled ablation).
-        replay_share: share of the batches that is replayed against forgetting: for the actor demonstrations and exercises,
-            for the critic judging questions.
+        replay_share: share of the batches that is replayed against forgetting: for the actor decisions of lessons, for
+            the critic judging questions.
         per_class: most kept trajectories per verb, robot and category.
     """
 
@@ -218,40 +216,13 @@ class CollectStageConfig:
 
     Attributes:
         views: posed views.
-        text_planning: episodes in words alone, for planning and for judging.
-        episodes: expert episodes.
         lessons: episodes of the rules, with mistakes among their steps.
         workers: processes.
     """
 
     views: int = 6000
-    text_planning: int = 2000
-    episodes: int = 500
     lessons: int = 500
     workers: int = 2
-
-
-@dataclass(frozen=True)
-class DaggerConfig:
-    """`stage=dagger`: the base model acts on training tasks, the expert names the right step in every state.
-
-    Attributes:
-        episodes: episodes in the simulator; those that do not end in success are dropped. 0 goes on without these.
-        text_planning: episodes in words alone; 0 goes on without these.
-        expert_share: share of the steps that the expert takes itself, so that episodes get somewhere.
-        workers: processes.
-    """
-
-    episodes: int = 0
-    text_planning: int = 0
-    expert_share: float = 0.25
-    workers: int = 2
-
-    def __post_init__(self) -> None:
-        for name in ("episodes", "text_planning"):
-            require(getattr(self, name) >= 0, f"{name} {getattr(self, name)} must not be negative")
-        require(self.workers > 0, f"workers {self.workers} must be positive")
-        _require_shares(self, "expert_share")
 
 
 @dataclass(frozen=True)
@@ -286,7 +257,6 @@ class TrainConfig:
         resume: continue an interrupted stage from its checkpoint.
         data: where motions come from, and what is kept of them.
         collect: what the simulator writes before training.
-        dagger: what it writes with the base model at the controls.
     """
 
     stage: StageName
@@ -301,7 +271,6 @@ class TrainConfig:
     practice: PracticeConfig
     data: DataConfig = field(default_factory=DataConfig)
     collect: CollectStageConfig = field(default_factory=CollectStageConfig)
-    dagger: DaggerConfig = field(default_factory=DaggerConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     output: str = "outputs"
     seed: int = 0

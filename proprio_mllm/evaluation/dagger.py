@@ -1,13 +1,9 @@
-"""DAgger: a model acts on training tasks and the expert names the step it would have taken in each state.
+"""Lessons in the simulator: the teacher's steps with mistakes among them, or a model's own steps (DAgger).
 
 Demonstrations hardly show what follows a learned planner's own mistakes: placing with an empty hand, picking up what it holds,
-asking for an object it has not seen, going where it stands. The base model's mistakes, each with the expert's next step, join
-the demonstrations of stages 2 and 3, and those in words alone (`sim.collection.text_planning`), which cost a fiftieth, the
-exercises. This is the bridge that `train.py` wires: training asks with a `DaggerRequest` and reads `demos` or `text_planning`
-shards.
-
-Lessons are the same with the teacher of `proprio_mllm.evaluation.lessons` in place of the expert and, without a student, its
-own steps with mistakes among them.
+asking for an object it has not seen, going where it stands. So the model of stage `words` acts on training tasks and its
+teacher, that of `proprio_mllm.evaluation.lessons`, names the right step in each state. This is the bridge that `train.py`
+wires: training asks with a `DaggerRequest` and reads `demos` shards.
 
 Part files are a function of the request and their number, so a run can be killed and continued. The paper has no such data; its
 pretrained backbone reads feedback in plain words already.
@@ -22,7 +18,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from tqdm import tqdm
@@ -37,13 +33,10 @@ from data.workers import worker_pool
 from proprio_mllm.planners.protocol import TaskInfo
 from proprio_mllm.training.rollouts import DaggerRequest
 
-if TYPE_CHECKING:
-    from proprio_mllm.planners.mllm import MllmPlanner
+__all__ = ["collect_dagger", "collect_lessons"]
 
-__all__ = ["collect_dagger", "collect_lessons", "student_in_text"]
-
-#: Episodes of a part; those in words go side by side.
-_PER_PART: Final[dict[str, int]] = {"demos": 10, "text_planning": 50}
+#: Episodes of a part.
+_PER_PART: Final = 10
 
 
 def collect_dagger(request: DaggerRequest, robots: Sequence[str] = PAPER_ROBOTS, workers: int = 2) -> None:
@@ -54,24 +47,19 @@ def collect_dagger(request: DaggerRequest, robots: Sequence[str] = PAPER_ROBOTS,
         robots: robots, in turn.
         workers: processes; 1 stays in this one.
     """
-    kind: Literal["demos", "text_planning"] = "demos" if request.kind == "lessons" else request.kind
     config = CollectConfig(
-        kind, str(request.folder), request.episodes, tuple(robots), seed=request.seed, image_size=request.image_size,
-        part_size=_PER_PART[kind], noise=request.expert_share, workers=workers,
+        "demos", str(request.folder), request.episodes, tuple(robots), seed=request.seed, image_size=request.image_size,
+        part_size=_PER_PART, noise=request.teacher_share, workers=workers,
     )  # fmt: skip
     model = str(request.model)
-    job = (
-        functools.partial(_lessons, config, student=model)
-        if request.kind == "lessons"
-        else functools.partial(_part, config, model=model)
-    )
-    with tqdm(desc=f"dagger ({request.kind})", unit="part") as bar:
+    job = functools.partial(_lessons, config, student=model)
+    with tqdm(desc="practice", unit="part") as bar:
 
         def report(done: int, parts: int) -> None:
             bar.total, bar.n = parts, done
             bar.refresh()
 
-        about = {"student": model, "expert_share": request.expert_share}
+        about = {"student": model, "teacher_share": request.teacher_share}
         _write(config, request.config_hash, job, about, report, overwrite=True)
 
 
@@ -181,46 +169,3 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-def _part(config: CollectConfig, part: int, model: str) -> list[dict[str, Any]]:
-    """One part; imports simulator and model only here, so that workers start light."""
-    if config.kind == "text_planning":
-        from sim.collection.text_planning import dagger_of_part as in_words
-
-        return list(in_words(config, part, student_in_text(model)))
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    from sim.collection.demonstrations import dagger_of_part
-
-    return list(dagger_of_part(config, part, _student(model)))
-
-
-@functools.cache
-def _planner(model: str) -> MllmPlanner:
-    import torch
-
-    from proprio_mllm.planners.mllm import MllmPlanner
-
-    torch.set_num_threads(1)
-    return MllmPlanner.load(Path(model))
-
-
-def _student(model: str) -> Callable[[Observation], PlanStep | None]:
-    """The model's step for what it sees."""
-    return lambda observation: _planner(model).step(observation, None).step
-
-
-def student_in_text(model: str) -> Callable[[Sequence[Mapping[str, Any]]], list[PlanStep | None]]:
-    """The model in a folder as a student of `sim.collection.text_planning`: greedy steps for moments in words."""
-    from proprio_mllm.model.batch import Example
-    from proprio_mllm.planners.protocol import parse_reply
-    from proprio_mllm.training.asking import LONGEST_STEP, replies
-    from proprio_mllm.training.sources import step_in_words
-
-    reader = _planner(model).model
-
-    def steps(moments: Sequence[Mapping[str, Any]]) -> list[PlanStep | None]:
-        asked = [Example(step_in_words(moment, None, reader.cfg)) for moment in moments]
-        return [parse_reply(text).step for text in replies(reader, asked, LONGEST_STEP)]
-
-    return steps

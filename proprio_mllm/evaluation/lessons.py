@@ -43,7 +43,7 @@ from proprio_mllm.model.wording import (
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 from proprio_mllm.training.sources import held_out
 from sim.collection.demonstrations import MISTAKES
-from sim.collection.text_planning import draw_task
+from sim.collection.text_tasks import draw_task
 from sim.collection.text_world import TextWorld, feedback_text
 from sim.robots.spec import load_robot
 from sim.scene.catalogue import load_catalogue

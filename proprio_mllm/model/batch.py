@@ -189,8 +189,7 @@ class Collator:
     def in_parts(self, examples: Sequence[Example], count: int = 3) -> tuple[Batch, ...]:
         """A training batch as a few batches of rows of similar length, so that little is computed on padding.
 
-        The model's loss on the tuple is that of the whole batch. On two cores three parts of 24 rows take 0.77 (exercises) to
-        0.84 (planning steps) of the whole batch's time (`benchmarks/batches.py`).
+        The model's loss on the tuple is that of the whole batch.
 
         Args:
             examples: conversations.

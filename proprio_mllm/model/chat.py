@@ -28,23 +28,18 @@ class Message:
         text: what is said.
         images: number of images that stand before the text.
         supervised: whether an assistant's text is learnt; context turns are not.
-        learnt: spans (start, end) of a user's text that are learnt too, in order. They begin and end where the tokenizer cuts
-            anyway: after a line end, before a space.
     """
 
     role: Role
     text: str
     images: int = 0
     supervised: bool = True
-    learnt: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self) -> None:
         if self.role not in ("system", "user", "assistant"):
             raise ValueError(f"role {self.role!r} is not allowed; allowed: system, user, assistant")
         if self.images and self.role != "user":
             raise ValueError(f"only user messages carry images, got {self.images} in a {self.role} message")
-        if self.learnt and self.role != "user":
-            raise ValueError(f"only user messages name spans to learn, got {self.learnt} in a {self.role} message")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +82,7 @@ def encode(tokenizer: PreTrainedTokenizerBase, messages: Sequence[Message], gene
     pieces: list[tuple[str, bool]] = []
     for m in messages:
         pieces.append((f"{_opening(m.role)}{IMAGE * m.images}", False))
-        at = 0
-        for start, end in m.learnt:
-            pieces += [(m.text[at:start], False), (m.text[start:end], True)]
-            at = end
-        pieces.append((f"{m.text[at:]}<|im_end|>", m.role == "assistant" and m.supervised))
+        pieces.append((f"{m.text}<|im_end|>", m.role == "assistant" and m.supervised))
         pieces.append(("\n", False))
     if generation:
         pieces.append((_opening("assistant"), False))

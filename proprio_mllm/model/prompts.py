@@ -26,7 +26,6 @@ __all__ = [
     "filled_motion",
     "looking",
     "made_motion",
-    "named_prompt",
     "plan_prompt",
     "self_ask_prompt",
     "with_answer",
@@ -78,18 +77,6 @@ def _log(history: Sequence[HistoryItem], last: int, style: Style) -> str:
     return "\n".join(lines) or ("" if style == "terse" else "nothing yet")
 
 
-def _learnt(history: Sequence[HistoryItem], last: int, right: Sequence[bool], start: int) -> tuple[tuple[int, int], ...]:
-    """Spans of the right steps in a log that begins at `start`; a log does not write steps of two actions as answers do."""
-    shown = list(zip(history, right, strict=True))[-last:] if last and right else []
-    spans: list[tuple[int, int]] = []
-    for item, learnt in shown:
-        line = item.feedback or item.step
-        if learnt and line.startswith(f"{item.step} "):
-            spans.append((start, start + len(item.step)))
-        start += len(line) + 1
-    return tuple(spans)
-
-
 def plan_prompt(
     instruction: str,
     robot: str,
@@ -101,7 +88,6 @@ def plan_prompt(
     motion: Sequence[int] | None = None,
     style: Style = "terse",
     last: int = 4,
-    right: Sequence[bool] = (),
 ) -> tuple[Message, ...]:
     """The planner's prompt about one image; the reply is `PlanStep` text.
 
@@ -116,8 +102,6 @@ def plan_prompt(
         motion: motion tokens of the last seconds, None leaves proprioception out.
         style: terse or full.
         last: number of earlier steps shown.
-        right: for training, whether each step of `history` is what the answer would have been at its moment, so that it is
-            learnt as the answer is; empty learns the answer alone.
     """
     other = _elsewhere(visible, known)
     if style == "terse":
@@ -133,7 +117,7 @@ def plan_prompt(
         )
         tail = "\nNext step?"
     text = f"{head}{_log(history, last, style)}{tail}"
-    return (_system("plan", style), Message("user", text, 1, learnt=_learnt(history, last, right, len(head))))
+    return (_system("plan", style), Message("user", text, 1))
 
 
 def with_answer(prompt: Sequence[Message], answer: str) -> tuple[Message, ...]:
@@ -222,19 +206,6 @@ def critic_prompt(
             f'Was the goal "{goal}" completed? Answer yes or no.'
         )
     return (_system("judge", style), Message("user", text, images=1))
-
-
-def named_prompt(instruction: str, visible: Sequence[str], known: Sequence[str], style: Style = "terse") -> tuple[Message, ...]:
-    """Which objects does an instruction name? The reply lists ids as `answers` writes them, in the task's order."""
-    other = _elsewhere(visible, known)
-    if style == "terse":
-        text = f"{instruction}\nsee {_ids(visible, style)}\nknow {_ids(other, style)}\nnamed?"
-    else:
-        text = (
-            f"Task: {instruction}\nIn view: {_ids(visible, style)}\nKnown elsewhere: {_ids(other, style)}\n"
-            f"Which objects does the task name? List their ids."
-        )
-    return (_system("judge", style), Message("user", text))
 
 
 def self_ask_prompt(

@@ -1,6 +1,6 @@
 """The memory of LLM-Planner and RAP: tasks that the expert solved, with its steps and what was seen between them.
 
-    python -m proprio_mllm memory [demos=outputs/tiny/data/demos] [out=outputs/memory] [limit=100]
+    python -m proprio_mllm memory [demos=outputs/demos] [out=outputs/memory] [limit=100]
 
 reads the demonstrations that `python train.py stage=data` collects in the training tasks, none of which is a task of the
 benchmark (`proprio_mllm.planners.memory_build`). A memory is a folder: `memory.jsonl` has a header line, then one JSON line per

@@ -65,7 +65,7 @@ class MemoryConfig:
         vision: folder of the image encoder whose features RAP compares views by; null makes a memory without pictures.
     """
 
-    demos: str = "outputs/tiny/data/demos"
+    demos: str = "outputs/demos"
     out: str = "outputs/memory"
     limit: int | None = 100
     seed: int = 0

@@ -9,10 +9,8 @@
 "Freeze the image and text weights separately" leaves open which weights; this reading freezes one modality's while the
 other's pairs train. Besides clip captions, motion and image to text holds questions about the robot's own body in its scene
 (which arm reaches an object, how far the body must go down), and motion to text asks which hands are open and how high the
-pelvis is, which captions do not say and planning needs. A share of planning demonstrations, with motion tokens in the prompt,
-keeps the planner's format, and exercises in words, now with motion that agrees with their log, keep what the base stage
-learnt from them; the paper does not mention any such replay. Corrections (`stage=dagger`) count as demonstrations and as
-exercises here.
+pelvis is, which captions do not say and planning needs. A share of decisions, with motion tokens before their answers, and of
+episodes in words keeps what was learnt before; the paper does not mention any such replay.
 
 The control `variant=no_proprio` has the joint phase alone, and of its pairs those that need no motion.
 """
@@ -39,7 +37,7 @@ from proprio_mllm.training.base import EPISODE_ROWS
 from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.loop import Parts
 from proprio_mllm.training.phrases import body_state_words
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, GoalQuestions, TextPlanning, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views, grips_of
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordBatch, WordsObjective
 
@@ -47,8 +45,6 @@ __all__ = [
     "PHASES",
     "AlignmentData",
     "AlignmentObjective",
-    "Episodes",
-    "Exercises",
     "Phase",
     "body_state",
     "body_state_accuracy",
@@ -74,22 +70,6 @@ PHASES: Final[Mapping[str, Phase]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Exercises:
-    """Where prompts are read: steps in words, and questions whether something was done."""
-
-    text_planning: TextPlanning
-    goal_questions: GoalQuestions
-
-
-@dataclass(frozen=True, slots=True)
-class Episodes:
-    """Where whole episodes are read: decisions with pictures, and episodes in words."""
-
-    turns: Turns
-    words: WordsObjective
-
-
 class AlignmentData:
     """Examples of every kind, with motion tokens computed once."""
 
@@ -100,16 +80,17 @@ class AlignmentData:
         clips: Clips,
         views: Views,
         demos: Demos,
-        told: Exercises | Episodes,
+        turns: Turns,
+        words: WordsObjective,
         cfg: AlignmentConfig,
     ) -> None:
         self.tokenizer, self.clips, self.views, self.demos = tokenizer, clips, views, demos
-        self.told = told
+        self.turns, self.words = turns, words
         self._cfg, self._collator = cfg, Collator(model.processor, model.cfg)
         self._style: Style = model.cfg.prompt
         self._proprioception = model.cfg.proprioception
         self._demo_tokens = demos.tokens(tokenizer) if self._proprioception else None
-        self.bodies = None if self._demo_tokens is None else Bodies(demos, self._demo_tokens)
+        self._grips = None if self._demo_tokens is None else grips_of(demos)
         with_images = [i for i, images in enumerate(clips.reader.column("image_frames")) if images]
         self._pictured = np.intersect1d(np.asarray(with_images, dtype=np.int64), clips.split.train)
         if self._proprioception and not len(self._pictured):
@@ -120,16 +101,11 @@ class AlignmentData:
 
     def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> tuple[Batch, ...] | Parts:
         """A batch of one kind from the training rows, in parts."""
-        if kind == "text" and isinstance(self.told, Episodes):
-            return self.told.words.batch(rng, max(1, size // EPISODE_ROWS))
+        if kind == "text":
+            return self.words.batch(rng, max(1, size // EPISODE_ROWS))
         return self._collator.in_parts(self._examples(kind, rng, size))
 
     def _examples(self, kind: Kind, rng: np.random.Generator, size: int) -> list[Example]:
-        if kind == "text":
-            assert isinstance(self.told, Exercises)
-            steps, questions = self.told.text_planning, self.told.goal_questions
-            judged = rng.random(size) < self._cfg.judge_share
-            return [questions.draw(rng) if one else steps.draw(rng, self.bodies) for one in judged]
         if kind == "plan":
             return [self._plan(int(i), rng) for i in self.demos.draw(rng, size)]
         if kind == "body":
@@ -146,9 +122,7 @@ class AlignmentData:
     def _plan(self, index: int, rng: np.random.Generator) -> Example:
         if rng.random() < self._cfg.judge_share:
             return judge_example(self.demos, index, rng, self._demo_tokens)
-        if isinstance(self.told, Episodes):
-            return self.told.turns.draw(rng, 1)[0]
-        return self.demos.example(index, None if self._demo_tokens is None else self._demo_tokens[index].tolist())
+        return self.turns.draw(rng, 1)[0]
 
     def _motion_text(self, kind: Kind, clip: int, codes: Sequence[int], rng: np.random.Generator) -> Example:
         caption = self.clips.caption(clip, rng)
@@ -161,10 +135,11 @@ class AlignmentData:
 
     def _feel(self, rng: np.random.Generator, size: int) -> list[Example]:
         """Every grip as often: full hands are rare."""
-        assert self.bodies is not None
-        grips = self.bodies.grips
+        grips, codes = self._grips, self._demo_tokens
+        assert grips is not None
+        assert codes is not None
         rows = [int(rng.choice(grips[group])) for group in rng.integers(len(grips), size=size)]
-        return [Example(body_state_prompt(self.bodies.row(i), *body_state(self.demos.motions[i]), self._style)) for i in rows]
+        return [Example(body_state_prompt(codes[i].tolist(), *body_state(self.demos.motions[i]), self._style)) for i in rows]
 
     def _say_image(self, clip: int, rng: np.random.Generator) -> Example:
         view, motion = self.clips.view(clip, rng)
@@ -233,8 +208,7 @@ class AlignmentObjective:
     ) -> tuple[Tensor, Mapping[str, float]]:
         """Cross-entropy over the answers; nothing is drawn."""
         if isinstance(batch, WordBatch):
-            assert isinstance(self._data.told, Episodes)
-            return self._data.told.words.loss(module, batch, generator)
+            return self._data.words.loss(module, batch, generator)
         kind, inputs = batch
         out = module(inputs)
         return out.loss, {f"{kind}_loss": float(out.loss.detach()), f"{kind}_accuracy": out.correct / max(out.supervised, 1)}

@@ -2,9 +2,8 @@
 
 Three parts, each needed (a small model trained on questions alone never binds words to image regions): dense, name-tied
 pretraining of the vision tower on the simulator's truth; grounding questions packed per image and image-to-text listing;
-planning demonstrations without proprioception, with judging questions about the expert's logs among them, and planning
-exercises and phrases in text alone. Its result is also the table row "Qwen2.5-VL-Ins" at this size. The paper has no such
-stage.
+decisions of whole episodes, with their pictures and in words alone, with judging questions about logs and phrases among them.
+Its result is also the table row "Qwen2.5-VL-Ins" at this size. The paper has no such stage.
 """
 
 from __future__ import annotations
@@ -22,19 +21,19 @@ from proprio_mllm.model.batch import Batch, Collator, Example, ImageBatch, Movab
 from proprio_mllm.model.dense import DenseHead, DenseTargets, dense_targets
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
-from proprio_mllm.training.asking import LONGEST_STEP, answer_shares, replies
+from proprio_mllm.training.asking import answer_shares
 from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.loop import Parts
 from proprio_mllm.training.phrases import phrase
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Bodies, Clips, Demos, TextPlanning, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordBatch, WordsObjective
 
-__all__ = ["DenseObjective", "EpisodeObjective", "JointObjective", "grounding_accuracy", "plan_accuracy", "text_accuracy"]
+__all__ = ["DenseObjective", "JointObjective", "grounding_accuracy"]
 
 #: Decisions that take as long as an episode in words.
 EPISODE_ROWS: Final = 4
-#: Share of phrases among the exercises.
+#: Share of phrases among the judging questions.
 PHRASES: Final = 0.1
 
 
@@ -69,7 +68,7 @@ class _WithDense(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class _JointBatch(Movable):
-    kind: Literal["dense", "look", "plan", "text", "judge"]
+    kind: Literal["dense", "look", "plan", "judge"]
     text: Batch | tuple[Batch, ...] | None
     images: ImageBatch | None
     dense: DenseTargets | None
@@ -121,44 +120,7 @@ class DenseObjective(_Base):
 
 
 class JointObjective(_Base):
-    """Mixed batches: packed grounding questions and listing with the dense loss, and planning without proprioception."""
-
-    name = "base/joint"
-
-    def __init__(
-        self,
-        model: ProprioMLLM,
-        head: DenseHead,
-        views: Views,
-        demos: Demos,
-        text_planning: TextPlanning,
-        clips: Clips,
-        cfg: BaseConfig,
-        key: str,
-    ) -> None:
-        super().__init__(model, head, views, cfg, key)
-        self._demos, self._text_planning, self._clips = demos, text_planning, clips
-
-    def batch(self, rng: np.random.Generator, size: int) -> _JointBatch:
-        """A batch of views or of planning steps."""
-        if rng.random() >= self._cfg.plan_share:
-            return self._view_batch(rng, size, self._cfg.questions)
-        if rng.random() < self._cfg.text_share:
-            return _JointBatch("text", self._collator.in_parts([self._words(rng) for _ in range(size)]), None, None, 0.0)
-        examples = [
-            judge_example(self._demos, i, rng, None) if rng.random() < self._cfg.judge_share else self._demos.example(i, None)
-            for i in self._demos.draw(rng, size)
-        ]
-        return _JointBatch("plan", self._collator.in_parts(examples), None, None, 0.0)
-
-    def _words(self, rng: np.random.Generator) -> Example:
-        if rng.random() < PHRASES:
-            return phrase(self._clips, rng, self._demos.style)
-        return self._text_planning.draw(rng)
-
-
-class EpisodeObjective(_Base):
-    """Mixed batches where whole episodes are read: decisions with pictures, episodes in words, and what `JointObjective` asks.
+    """Mixed batches: packed grounding questions and listing with the dense loss, decisions with pictures, episodes in words.
 
     Args:
         model: starts with the language model of stage `practice`.
@@ -246,27 +208,3 @@ def grounding_accuracy(
             result |= answer_shares(model, kind, asked, answers)
     result["asked_views"] = float(len(rows))
     return result
-
-
-@torch.no_grad()
-def text_accuracy(
-    model: ProprioMLLM, text_planning: TextPlanning, bodies: Bodies | None = None, limit: int = 200
-) -> dict[str, float]:
-    """Share of held-out exercises without pictures that the model's greedy reply repeats exactly; `bodies` adds motion."""
-    rng = np.random.default_rng(0)
-    order = [int(i) for i in text_planning.test[:: max(1, len(text_planning.test) // limit)][:limit]]
-    said = replies(model, [text_planning.example(i, rng, bodies, answered=False) for i in order], LONGEST_STEP)
-    exact = sum(reply == text_planning.target(i) for i, reply in zip(order, said, strict=True))
-    return {"text_exact": exact / max(len(order), 1), "text_steps": float(len(order))}
-
-
-@torch.no_grad()
-def plan_accuracy(model: ProprioMLLM, demos: Demos, tokens: Any = None, limit: int = 200) -> dict[str, float]:
-    """Share of held-out expert steps that the model's greedy reply repeats exactly, and whose action name it repeats."""
-    motion = None if tokens is None else demos.tokens(tokens)
-    order = [int(i) for i in demos.split.test[:limit]]
-    asked = [demos.example(i, None if motion is None else motion[i].tolist(), answered=False) for i in order]
-    pairs = [(reply, demos.target(i)) for i, reply in zip(order, replies(model, asked, LONGEST_STEP), strict=True)]
-    exact = sum(reply == target for reply, target in pairs)
-    verb = sum(reply.split("(")[0].strip() == target.split("(")[0] for reply, target in pairs)
-    return {"plan_exact": exact / max(len(order), 1), "plan_verb": verb / max(len(order), 1), "plan_steps": float(len(order))}

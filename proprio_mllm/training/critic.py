@@ -23,7 +23,7 @@ from proprio_mllm.model.building import use_adapter
 from proprio_mllm.model.chat import Message
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.observing import EpisodeLog, pictured_turn
-from proprio_mllm.model.prompts import Style, answers, critic_prompt, plan_prompt, self_ask_prompt, with_answer
+from proprio_mllm.model.prompts import Style, answers, critic_prompt, self_ask_prompt, with_answer
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import answer_words
 from proprio_mllm.training.goal_questions import LOG_LENGTH
@@ -41,7 +41,6 @@ __all__ = [
     "audit",
     "critic_examples",
     "keep",
-    "turn_examples",
 ]
 
 Motion = Sequence[int] | None
@@ -232,39 +231,12 @@ def keep(
     return kept
 
 
-def actor_examples(kept: Sequence[Kept], style: Style, last: int) -> list[Example]:
-    """Planning examples of kept trajectories: every step that worked, up to the moment at which the goal held.
+def actor_examples(model: ProprioMLLM, kept: Sequence[Kept]) -> list[Example]:
+    """Decisions of kept trajectories: every step that worked, up to the moment at which the goal held.
 
     `Done()` is never a target: an episode ends by itself when its goals hold, and relabelled goals would teach to stop early.
-    Going where the robot has just gone works, but teaches to stand still.
-    """
-    examples: list[Example] = []
-    for item in kept:
-        t, rollout = item.trajectory, item.trajectory.rollout
-        for at in range(item.end):
-            moment = rollout.moments[at]
-            if not moment.ok or moment.step == "Done()" or _stays(rollout, at):
-                continue
-            prompt = plan_prompt(
-                item.goal,
-                rollout.robot,
-                moment.visible,
-                moment.known,
-                rollout.history(at),
-                moment.number,
-                rollout.time_limit,
-                t.motion[at],
-                style,
-                last,
-            )
-            examples.append(Example(with_answer(prompt, moment.step), (rollout.view(at),)))
-    return examples
-
-
-def turn_examples(model: ProprioMLLM, kept: Sequence[Kept]) -> list[Example]:
-    """`actor_examples` for models that read whole episodes.
-
-    The sub-goal of an answer is told in hindsight: it is the next action of an arm that worked.
+    Going where the robot has just gone works, but teaches to stand still. The sub-goal of an answer is told in hindsight: it is
+    the next action of an arm that worked.
     """
     examples: list[Example] = []
     for item in kept:

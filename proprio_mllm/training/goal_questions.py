@@ -1,7 +1,7 @@
-"""Judging exercises from expert logs: was the goal completed, and which objects are in a state.
+"""Judging exercises from the logs of lessons: was the goal completed, and which objects are in a state.
 
 A released model can answer such questions; the tiny one has to learn it. The answers come from what the log itself says (an
-action with `ok`, or the end of an expert's successful episode), never from privileged simulator state, so a judge learns to
+action with `ok`, or the end of a successful episode), never from privileged simulator state, so a judge learns to
 read its inputs only.
 """
 
@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.observation import HistoryItem
 from proprio_mllm.model.batch import Example
 from proprio_mllm.model.prompts import answers, critic_prompt, self_ask_prompt, with_answer
 from proprio_mllm.training.sources import Demos
@@ -25,14 +24,13 @@ LOG_LENGTH: Final = 8
 
 
 def judge_example(demos: Demos, index: int, rng: np.random.Generator, tokens: NDArray[np.int64] | None) -> Example:
-    """A judging conversation about the state before expert step `index`, with its answer.
+    """A judging conversation about the state before step `index`, with its answer.
 
-    Half of them ask whether a goal was completed: the episode's own, which is so after its last step only, or another
-    episode's instruction; the others ask which objects are in a relation. The view after the last step is not recorded: the
-    one before it stands in, with the last step in the log.
+    Half of them ask whether a goal was completed: the episode's own, which is so at its end only, or another episode's
+    instruction; the others ask which objects are in a relation.
 
     Args:
-        demos: expert steps.
+        demos: steps of lessons.
         index: a training row.
         rng: draws the question, and whether the end of another episode is asked about.
         tokens: motion tokens (rows, tokens) of all rows, None leaves proprioception out.
@@ -44,8 +42,6 @@ def judge_example(demos: Demos, index: int, rng: np.random.Generator, tokens: ND
     row = demos.reader[int(index)]
     motion = None if tokens is None else tokens[int(index)].tolist()
     history = history_of(row)
-    if ended and row["target"] != "Done()":
-        history.append(HistoryItem(row["target"], "; ".join(f"{part.strip()} ok" for part in row["target"].split("&"))))
     if rng.random() < 0.5:
         goal, done = row["instruction"], ended
         if ended and rng.random() < 0.3:

@@ -1,6 +1,6 @@
 """Muon: momentum whose update is orthogonalised, for the weight matrices of linear layers; AdamW for everything else.
 
-From scratch it needs about half of AdamW's steps (`benchmarks/optimizers.py`). torch has a Muon too: it orthogonalises in
+From scratch it needed about half of AdamW's steps. torch has a Muon too: it orthogonalises in
 bfloat16, four times slower than float32 on processors without matrix units for it, and it takes matrices only, while the loop
 and its checkpoints keep one optimiser.
 

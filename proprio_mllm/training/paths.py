@@ -1,7 +1,7 @@
 """Where stages keep their outputs, and when an output is current.
 
-    <output>/<model>/data/{clips,views,text_planning,demos,dagger,…}   shards, shared by all variants
-    <output>/<model>/shared/{words,practice,base,dagger,pointmap,tokenizer}
+    <output>/<model>/data/{clips,views,lessons,practice}   shards, shared by all variants
+    <output>/<model>/shared/{words,practice,base,pointmap,tokenizer}
     <output>/<model>/<variant>/{alignment,selu}
 
 A finished stage writes `done.json` with its key (hash of configuration and inputs) and its metrics; the stage is current while
@@ -22,7 +22,7 @@ from data.shards import config_hash
 
 __all__ = ["StagePaths", "finish", "finished_key", "stage_key"]
 
-_SHARED = ("words", "practice", "base", "dagger", "pointmap", "tokenizer")
+_SHARED = ("words", "practice", "base", "pointmap", "tokenizer")
 
 
 class StagePaths:

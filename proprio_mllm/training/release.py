@@ -105,8 +105,7 @@ def _shrink(folder: Path) -> None:
 
 def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
     shards = {}
-    kinds = ("clips", "views", "text_planning", "goal_questions", "demos", "dagger", "dagger_in_text", "lessons", "practice")
-    for kind in kinds:
+    for kind in ("clips", "views", "lessons", "practice"):
         folder = pipeline.paths.shards(kind)
         if (folder / "manifest.json").is_file():
             shards[kind] = shard_hash(folder)

@@ -15,7 +15,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,26 +51,23 @@ class RolloutRequest:
 
 @dataclass(frozen=True, slots=True)
 class DaggerRequest:
-    """What is asked of whoever lets a model act and has the expert correct it.
+    """What is asked of whoever lets a model act and has its teacher correct it.
 
     Attributes:
         model: folder of the model that acts.
-        folder: shard folder to write.
-        kind: `demos` in the simulator, which drops episodes without success, `text_planning` in words
-            alone, or `lessons`, which are `demos` of a words model and its teacher.
+        folder: shard folder to write, kind `demos`.
         episodes: number of episodes.
         seed: of tasks and draws.
-        expert_share: share of the steps that the expert takes itself.
+        teacher_share: share of the steps that the teacher takes itself.
         image_size: side of the pictures, pixels.
         config_hash: hash to store in the shard's manifest.
     """
 
     model: Path
     folder: Path
-    kind: Literal["demos", "text_planning", "lessons"]
     episodes: int
     seed: int
-    expert_share: float
+    teacher_share: float
     image_size: int
     config_hash: str
 

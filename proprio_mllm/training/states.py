@@ -7,12 +7,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from data.interface.bodies import Arm
 from data.interface.effects import Condition
 from data.interface.observation import HistoryItem
 from data.interface.symbolic import SymbolicState, events_of
 
-__all__ = ["asked_relation", "history_of", "open_hands", "states_from_log"]
+__all__ = ["asked_relation", "history_of", "states_from_log"]
 
 #: States that are asked about, by the words for being in them and for not.
 _WORDS: Final[Mapping[Condition, tuple[str, str]]] = {
@@ -37,28 +36,17 @@ def asked_relation(states: Mapping[str, Sequence[str]], rng: np.random.Generator
     return names[int(rng.integers(len(names)))]
 
 
-def _state_after(history: Sequence[HistoryItem]) -> SymbolicState:
-    state = SymbolicState()
-    for events in events_of(history):
-        for event in events:
-            if event.ok:
-                state.succeed(event.action)
-    return state
-
-
-def open_hands(history: Sequence[HistoryItem]) -> tuple[bool, bool]:
-    """Whether the left and the right hand are empty after a log that begins with empty hands."""
-    free = _state_after(history).free_arms()
-    return Arm.LEFT in free, Arm.RIGHT in free
-
-
 def states_from_log(history: Sequence[HistoryItem]) -> dict[str, tuple[str, ...]]:
     """Objects in each relation according to the successful actions of a log.
 
     Relations: `held`, `lifted`, `open`, `closed`, `switched on`, `switched off`, `sliced`, `clean`, `used up`, `filled`, and
     `on R` for receptacles R.
     """
-    state = _state_after(history)
+    state = SymbolicState()
+    for events in events_of(history):
+        for event in events:
+            if event.ok:
+                state.succeed(event.action)
     found: dict[str, list[str]] = {word: [] for words in _WORDS.values() for word in words if word}
     for condition, (yes, no) in _WORDS.items():
         for obj, value in state.conditions[condition].items():

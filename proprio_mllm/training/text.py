@@ -15,7 +15,7 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import critic_prompt, looking, self_ask_prompt
 from proprio_mllm.training.goals import type_words
 from proprio_mllm.training.phrases import phrase
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, TextPlanning, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
 
 __all__ = ["adopt", "corpus", "start_from_words", "whole_words"]
 
@@ -23,30 +23,21 @@ __all__ = ["adopt", "corpus", "start_from_words", "whole_words"]
 def corpus(
     cfg: ModelConfig,
     views: Views,
-    demos: Demos | None,
-    text_planning: TextPlanning | None,
     clips: Clips,
     seed: int = 0,
     limit: int = 4000,
 ) -> list[str]:
-    """Texts of every kind that the model will read or write.
+    """Texts of every kind that the model will read or write beside episodes, whose words are tokens already.
 
     Args:
         cfg: prompt style.
         views: shards.
-        demos: shards; None where planning is told in words that are tokens already.
-        text_planning: shards; None likewise.
         clips: shards.
         seed: of the choice of rows.
         limit: rows per kind.
     """
     rng = np.random.default_rng(seed)
     texts = [caption for captions in clips.captions[:limit] for caption in captions]
-    if demos is not None:
-        for index in _some(demos.split.train, limit, rng):
-            texts.append(render(demos.example(int(index), None).messages))
-    if text_planning is not None:
-        texts.extend(render(text_planning.draw(rng).messages) for _ in range(limit))
     texts.extend(render(phrase(clips, rng, cfg.prompt).messages) for _ in range(limit // 4))
     for index in _some(views.split.train, limit // 4, rng):
         row = views.row(int(index))

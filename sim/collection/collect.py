@@ -1,4 +1,4 @@
-"""Collects training shards: posed views and demonstrations of the expert from the simulator, and exercises in words.
+"""Collects training shards: posed views and demonstrations of the expert from the simulator.
 
     python -m sim collect kind=views out=outputs/views count=4800 workers=2
     python -m sim collect kind=demos out=outputs/demos count=600 workers=2
@@ -30,14 +30,11 @@ __all__ = ["collect", "main", "parts_of", "rows_of_part"]
 _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.
-_VERSION = {"views": 2, "demos": 3, "text_planning": 3, "goal_questions": 3}
-_IN_WORDS = ("out", "workers", "views_per_world", "image_size", "noise", "medium_share")
+_VERSION = {"views": 2, "demos": 3}
 #: Fields that do not change what is written.
 _UNKEYED = {
     "views": ("out", "workers", "noise", "medium_share"),
     "demos": ("out", "workers", "views_per_world"),
-    "text_planning": _IN_WORDS,
-    "goal_questions": _IN_WORDS,
 }
 
 
@@ -52,14 +49,6 @@ def rows_of_part(config: CollectConfig, part: int) -> list[dict[str, Any]]:
         from sim.collection.view_sampling import views_of_part
 
         return list(views_of_part(config, part))
-    if config.kind == "text_planning":
-        from sim.collection.text_planning import text_planning_of_part
-
-        return list(text_planning_of_part(config, part))
-    if config.kind == "goal_questions":
-        from sim.collection.text_planning import goal_questions_of_part
-
-        return list(goal_questions_of_part(config, part))
     from sim.collection.demonstrations import demos_of_part
 
     return list(demos_of_part(config, part))

@@ -39,12 +39,10 @@ __all__ = [
     "Student",
     "Teacher",
     "accepted",
-    "dagger_of_part",
     "demos_of_part",
     "draw_family",
     "lessons_of_part",
     "perturbed",
-    "run_dagger_episode",
     "run_episode",
     "run_lesson",
 ]
@@ -62,13 +60,8 @@ _SEEDS_PER_COLLECTION: Final = 1_000_000
 #: The expert gives an episode up when it has thought about this many stances: four fifths of the time went into episodes that
 #: failed in the end and were dropped.
 _REHEARSALS: Final = 6
-#: The same where a student leads the robot astray, and the steps that the expert has for finishing after it.
-_STUDENT_REHEARSALS: Final = 16
-_FINISH: Final = 10
-#: Episodes with a student take their tasks from here on, so that they share none with the expert's own.
-_STUDENT_FROM: Final = 500_000
-#: The same for lessons and for those of a student, the steps after which one ends, and shares of steps that are mistakes, one
-#: drawn per lesson.
+#: Lessons and those of a student take their tasks from here on, so that they share none with the expert's own; the steps after
+#: which one ends; shares of steps that are mistakes, one drawn per lesson.
 _LESSONS_FROM: Final = 700_000
 _PRACTICE_FROM: Final = 800_000
 _LESSON_STEPS: Final = 32
@@ -123,11 +116,6 @@ def run_episode(config: CollectConfig, index: int, sessions: dict[tuple[str, str
     return episode
 
 
-def dagger_of_part(config: CollectConfig, part: int, student: Student) -> Iterator[dict[str, Any]]:
-    """Rows of one part of a `demos` folder whose steps the student chose and the expert corrected."""
-    yield from _rows_of_part(config, part, lambda cfg, index, sessions: run_dagger_episode(cfg, index, sessions, student))
-
-
 def accepted(proposed: PlanStep | None, last: HistoryItem | None) -> PlanStep | None:
     """The student's step; None where it names none, ends the episode, or does again what has just failed.
 
@@ -152,39 +140,6 @@ def _rows_of_part(config: CollectConfig, part: int, play: Play, all_kept: bool =
     finally:
         for session in sessions.values():
             session.close()
-
-
-def run_dagger_episode(
-    config: CollectConfig, index: int, sessions: dict[tuple[str, str], Session] | None, student: Student
-) -> Episode:
-    """Plays one episode in which a student acts and the expert names the step it would have taken.
-
-    Args:
-        config: the collection; `noise` is the share of steps that the expert takes itself.
-        index: number of the episode.
-        sessions: sessions by (robot, difficulty), reused between episodes.
-        student: the learned planner.
-    """
-    rng = rng_for("corrections", config.seed, index)
-    sessions = {} if sessions is None else sessions
-    robot, task, session, observation = _start(config, _STUDENT_FROM + index, rng, sessions, _FINISH)
-    expert = Expert(session, rehearsals=_STUDENT_REHEARSALS)
-    expert.reset()
-    episode = Episode()
-    while not session.finished:
-        target = expert.next_step()
-        step, origin = target, "expert"
-        if rng.random() >= config.noise and session.stats.charged < task.time_limit - _FINISH:
-            proposed = accepted(student(observation), observation.history[-1] if observation.history else None)
-            if proposed is not None:
-                step, origin = proposed, "student"
-        executed = {"executed": step.to_text(), "origin": origin}
-        episode.rows.append(_row(observation, task, robot, _STUDENT_FROM + index, target, executed))
-        if target.actions[0].name == "Done":
-            break
-        observation, _ = session.step(step)
-    episode.success, episode.steps = session.succeeded, len(episode.rows)
-    return episode
 
 
 def lessons_of_part(

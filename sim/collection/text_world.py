@@ -3,7 +3,7 @@
 Preconditions and effects come from `data.interface.actions`, so every action is there with its failure codes. What the table
 does not know is drawn here, because it follows from geometry in the simulator: what one stands at, which things there are near
 enough, from which pelvis heights the arms reach a piece of furniture, what comes into view, and what now and then does not work
-from a stance. The expert's job planner (`sim.expert.jobs`) names the right step.
+from a stance.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from data.interface.effects import Condition, PutDown
 from data.interface.failures import FailureCode
 from data.interface.steps import Action, PlanStep
 from sim.collection.text_facts import TextFacts
-from sim.expert.jobs import Job, plan_jobs
+from sim.expert.jobs import plan_jobs
 from sim.robots.spec import RobotSpec
 from sim.tasks.drafts import Draft, Scene
 
@@ -60,8 +60,6 @@ _MISHAPS: Final = (
     FailureCode.POUR_MISSED,
     FailureCode.RECEPTACLE_FULL,
 )
-#: Sides from which to try again.
-_BEARINGS_DEG: Final = (-20.0, 20.0)
 _FREE_ARMS: Final = (Arm.RIGHT, Arm.LEFT)
 _MOVES: Final = tuple(name for name, spec in ACTIONS.items() if spec.kind is ActionKind.BODY and not spec.takes_object)
 _LEGS: Final = ("MoveUp", "MoveDown")
@@ -87,15 +85,12 @@ class TextWorld:
         self._height_m = float(rng.choice(_STARTS_M))
         self._lowest_m = float(rng.choice(_LOWEST_M))
         self._bands = {name: self._band() for name in scene.furniture}
-        #: Whether a refusal has told the robot that its height is wrong here.
-        self._told = False
         self.seen: set[str] = set()
         self.visible: list[str] = []
         self._last: Action | None = None
-        #: What does not work from this stance, and how often the robot has come to this place anew.
+        #: What does not work from this stance.
         self._awkward: dict[Action, FailureCode] = {}
-        self._approaches = 0
-        self._at, self._front, self._near, self._left_first = "", "", set[str](), False
+        self._at, self._front, self._near = "", "", set[str]()
         far = _FAR[self._solver]
         hard = {name: rng.random() < _AWKWARD_PLACE[self._solver] for name in (*scene.furniture, *draft.objects)}
         self._far = {name: _FAR_THERE if is_hard else far for name, is_hard in hard.items()}
@@ -151,11 +146,8 @@ class TextWorld:
     def _arrive(self, place: str, near: bool = True, wanted: str = "") -> None:
         """Stands in front of a piece of furniture and looks."""
         if place != self._at:
-            self._approaches = 0
             self._awkward.clear()
         self._at = self._front = place
-        self._told = False
-        self._left_first = bool(self._rng.random() < 0.35)
         ids = self._scene.furniture
         here = ids.index(place)
         beside = [ids[i] for i in range(max(0, here - 2), min(len(ids), here + 3)) if i != here and self._rng.random() < 0.4]
@@ -173,58 +165,6 @@ class TextWorld:
     def done(self) -> bool:
         """Whether every goal holds."""
         return not plan_jobs(self._draft.goals, self.facts.for_jobs())
-
-    # ---- the right step
-
-    def answer(self) -> tuple[PlanStep, bool] | None:
-        """The step to take, and whether it follows from what the robot knows; None when every goal holds."""
-        jobs = plan_jobs(self._draft.goals, self.facts.for_jobs())
-        if not jobs:
-            return None
-        head = jobs[0]
-        standing = not head.target or (self._reaches(head.target) and not self._misfit_m(head.target))
-        door = next((arm for arm in Arm if (name := self.facts.held(arm)) is not None and name in self._bands), None)
-        if door is not None and not standing:  # a hand at a door keeps the robot there: let go and begin anew
-            return PlanStep((Action("Release", arm=door),)), True
-        if head.target in self.facts.objs and head.target not in self.seen:
-            carrier = self._place(head.target) or self._at
-            if self._at != carrier:
-                return PlanStep((Action("GoTo", object_id=carrier),)), True
-            turn = Action(str(self._rng.choice(("RotateLeft", "RotateRight"))), amount=15.0 * float(self._rng.integers(1, 6)))
-            return PlanStep((turn,)), False
-        if not standing and not self._reaches(head.target):
-            return PlanStep((Action("GoTo", object_id=head.target),)), True
-        if not standing:
-            misfit = self._misfit_m(head.target)
-            move = Action("MoveUp" if misfit > 0 else "MoveDown", amount=round(abs(misfit), 2))
-            return PlanStep((move,)), self._told
-        arms = [arm for arm in self._arms(head) if head.action(arm) not in self._awkward]
-        if not arms:
-            side = _BEARINGS_DEG[self._approaches % len(_BEARINGS_DEG)]
-            return PlanStep((Action("GoTo", object_id=head.target, bearing_deg=side),)), True
-        return self._with_companion(head, arms[0], jobs[1:]), True
-
-    def _arms(self, job: Job) -> list[Arm | None]:
-        """Arms that may do the job, preferred one first."""
-        if job.arm is not None or ACTIONS[job.verb].kind is ActionKind.TWO_ARM:
-            return [job.arm]
-        free: list[Arm | None] = [arm for arm in _FREE_ARMS if self.facts.held(arm) is None]
-        return free[::-1] if self._left_first else free
-
-    def _with_companion(self, head: Job, arm: Arm | None, others: Sequence[Job]) -> PlanStep:
-        first = head.action(arm)
-        for job in others:
-            known = job.target not in self.facts.objs or job.target in self.seen
-            if arm is None or not known or not self._reaches(job.target) or self._misfit_m(job.target):
-                continue
-            if ACTIONS[job.verb].kind is ActionKind.TWO_ARM or job.arm is arm:
-                continue
-            if job.arm is None and self.facts.held(arm.other) is not None:
-                continue
-            second = job.action(arm.other)
-            if second not in self._awkward and not exclude_each_other(first, second):
-                return PlanStep((first, second))
-        return PlanStep((first,))
 
     # ---- what actions do
 
@@ -256,7 +196,6 @@ class TextWorld:
             return FailureCode.TOO_FAR
         misfit = self._misfit_m(target)
         if misfit:
-            self._told = True
             return FailureCode.BODY_TOO_LOW if misfit > 0 else FailureCode.BODY_TOO_HIGH
         if action in self._awkward:
             return self._awkward[action]
@@ -277,7 +216,6 @@ class TextWorld:
             if self._rng.random() < _BLOCKED[action.name]:
                 return FailureCode.BLOCKED_PATH
             if place == self._at and self._awkward and (action.bearing_deg or action.amount):  # the plain stance is the old one
-                self._approaches += 1
                 self._awkward.clear()
             self._arrive(place, wanted=target)
         elif action.name in _LEGS:
@@ -287,7 +225,6 @@ class TextWorld:
                 self._awkward.clear()
                 return FailureCode.HEIGHT_LIMIT
             self._height_m += change
-            self._told = False
             self._awkward.clear()
             self._look(_LOOK[action.name])
         elif self._rng.random() < _BLOCKED.get(action.name, _BLOCKED_STEP):

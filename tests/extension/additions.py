@@ -147,7 +147,7 @@ assert "ok" in codes, codes
 assert set(codes) <= {"ok", *ACTIONS["Tap"].codes}, codes
 print("works")
 """,
-    ("tests/data/interface", "tests/sim/collection/test_text_planning.py", "tests/planners/chat/dag_plan/test_checks.py"),
+    ("tests/data/interface", "tests/sim/collection/test_text_world.py", "tests/planners/chat/dag_plan/test_checks.py"),
 )
 
 QUANTIZER = Addition(

@@ -101,8 +101,6 @@ def test_messages_are_checked():
         Message("tool", "x")
     with pytest.raises(ValueError, match="only user messages"):
         Message("assistant", "x", images=1)
-    with pytest.raises(ValueError, match="only user messages name spans"):
-        Message("assistant", "x", learnt=((0, 1),))
 
 
 def test_processor_expands_the_pad_as_the_collator_does(cfg, processor, examples):
@@ -147,27 +145,6 @@ def test_terse_plan_prompt_by_hand():
     bare = prompts.plan_prompt("tidy up", "h1", [], [], _history()[:1], 0, 9)[1].text
     assert bare == "h1 1/9 tidy up\nsee \nknow \ndid\nMoveUp(0.0)"
     assert prompts.plan_prompt("tidy up", "h1", [], [], _history(), 0, 9, last=0)[1].text.endswith("did\n")
-
-
-@pytest.mark.parametrize("style", ["terse", "full"])
-def test_right_steps_of_the_log_are_learnt_as_the_answer_is(processor, style):
-    log = [
-        HistoryItem("GoTo(Mug_1)", "GoTo(Mug_1) ok"),
-        HistoryItem("Pick(left, Mug_1)", "Pick(left, Mug_1) TooFar"),
-        HistoryItem("Pick(left, Mug_1) & Pick(right, Cup_1)", "Pick(left, Mug_1) ok; Pick(right, Cup_1) ok"),
-        HistoryItem("Place(left, Sofa_1)", "Place(left, Sofa_1) ok"),
-        HistoryItem("MoveUp(0.1)", ""),
-    ]
-    right = [True, True, True, False, True]
-    asked = prompts.plan_prompt("tidy up", "h1", ["Mug_1"], [], log, 5, 9, None, style, 4, right)
-    messages = prompts.with_answer(asked, "MoveUp(0.2)")
-    encoded = encode(processor.tokenizer, messages)
-    assert list(encoded.ids) == processor.tokenizer(render(messages))["input_ids"]
-    taught = [i for i, target in zip(encoded.ids, encoded.targets, strict=True) if target]
-    assert processor.tokenizer.decode(taught) == "Pick(left, Mug_1)MoveUp(0.2)<|im_end|>"
-    assert prompts.plan_prompt("tidy up", "h1", ["Mug_1"], [], log, 5, 9, None, style, 4)[1].learnt == ()
-    with pytest.raises(ValueError, match="argument 2 is shorter"):
-        prompts.plan_prompt("tidy up", "h1", [], [], log, 5, 9, right=[True])
 
 
 def test_full_prompts_say_the_same():

@@ -72,7 +72,7 @@ def test_it_says_where_it_comes_from(name: str) -> None:
     assert {path.suffix for path in files} <= {".json", ".jinja", ".safetensors"}
     note = json.loads((WEIGHTS / name / "provenance.json").read_text())
     assert note["seed"] == 0
-    assert {"views", "demos", "text_planning"} <= set(note["shards"])
+    assert {"views", "clips"} <= set(note["shards"])
     assert list(note["stages"]) == (STAGES[:1] if name == "base" else STAGES)
     for stage in note["stages"].values():
         assert stage["command"].startswith("python train.py stage=")

@@ -96,10 +96,10 @@ def write_views(folder: Path, count: int = 40) -> Path:
     return folder
 
 
-PLAN = ("GoTo(Mug_1)", "MoveDown(0.2)", "Pick(left, Mug_1)")
+PLAN = ("GoTo(Mug_1)", "MoveDown(0.2)", "Pick(left, Mug_1)", "Done()")
 
 
-def write_demos(folder: Path, episodes: int = 40) -> Path:
+def write_lessons(folder: Path, episodes: int = 40) -> Path:
     rng = np.random.default_rng(2)
     rows = []
     for episode in range(episodes):
@@ -137,32 +137,6 @@ def write_demos(folder: Path, episodes: int = 40) -> Path:
             )
             history.append({"step": text, "feedback": f"{text} ok"})
     writer = ShardWriter(folder, "demos", "test")
-    writer.write(0, rows)
-    writer.finish({})
-    return folder
-
-
-def write_exercises(folder: Path, kind: str = "text_planning", episodes: int = 30) -> Path:
-    rows = []
-    for episode in range(episodes):
-        target = f"{TYPES[episode % len(TYPES)]}_1"
-        for step, template in enumerate(PLAN):
-            text = template.replace("Mug_1", target)
-            rows.append(
-                {
-                    "instruction": f"Pick up the {target.split('_')[0].lower()}.",
-                    "robot": "h1",
-                    "category": "single",
-                    "step": step,
-                    "time_limit": 8,
-                    "visible": [target],
-                    "known": [target, "CoffeeTable_2"],
-                    "history": [{"step": "MoveAhead(0.1)", "feedback": "MoveAhead(0.1) ok"}] * step,
-                    "named": [target],
-                    "target": text if kind == "text_planning" else ("no", "yes")[step == len(PLAN) - 1],
-                }
-            )
-    writer = ShardWriter(folder, kind, "test")
     writer.write(0, rows)
     writer.finish({})
     return folder
@@ -206,12 +180,10 @@ def one_thread() -> None:
 
 @pytest.fixture(scope="session")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with `views`, `text_planning`, `demos` and `clips`."""
+    """A folder with `views`, `lessons` and `clips`."""
     root = tmp_path_factory.mktemp("shards")
     write_views(root / "views", 60)
-    write_demos(root / "demos")
-    write_exercises(root / "text_planning")
-    write_exercises(root / "goal_questions", "goal_questions")
+    write_lessons(root / "lessons")
     write_clips(root / "clips")
     return root
 

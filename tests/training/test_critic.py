@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from configs.compose import compose
 from configs.schema.model import ModelConfig
-from proprio_mllm.training.critic import Judge, Trajectory, actor_examples, audit, critic_examples, keep
+from configs.schema.train import TrainConfig
+from configs.validate import build
+from proprio_mllm.evaluation.lessons import Lessons
+from proprio_mllm.model.building import build_model, build_processor
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.word_tokens import add_word_tokens, known_words
+from proprio_mllm.model.wording import id_words, read_step
+from proprio_mllm.training.critic import Judge, Kept, Trajectory, actor_examples, audit, critic_examples, keep
 from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.goals import Relabel
+from proprio_mllm.training.pipeline import base_model_config
 from proprio_mllm.training.rollouts import Moment, Rollout
 from proprio_mllm.training.sources import Demos
 
@@ -52,10 +62,33 @@ def trajectory(episode: str, steps: Sequence[tuple[str, bool]], instruction: str
     return Trajectory(rollout, (None,) * count)
 
 
+@pytest.fixture(scope="module")
+def reader() -> ProprioMLLM:
+    """A small model that reads whole episodes in words."""
+    whole = build(TrainConfig, compose("train", [])).model
+    text = dataclasses.replace(whole.text, hidden=64, layers=2, heads=2, kv_heads=1, intermediate=96)
+    cfg = dataclasses.replace(base_model_config(whole), episodes=True, sees=False, text=text)
+    words = Lessons().words()
+    processor = build_processor(cfg, [" ".join(words)] * 2)
+    add_word_tokens(processor.tokenizer, words)
+    return build_model(cfg, processor, 0)
+
+
+def taught(model: ProprioMLLM, kept: Sequence[Kept]) -> list[str]:
+    """The steps that the actor is to learn."""
+    words = {token: word for word, token in known_words(model.processor.tokenizer).items()}
+    ids, found = {id_words(name): name for name in KNOWN}, list[str]()
+    for example in actor_examples(model, kept):
+        assert example.tokens is not None
+        pairs = zip(example.tokens.ids, example.tokens.targets, strict=True)
+        found.append(read_step([words[token] for token, target in pairs if target], ids).to_text())
+    return found
+
+
 PICK_PLATE = [("GoTo(Plate_1)", True), ("Pick(left, Plate_1)", False), ("Pick(right, Plate_1)", True), ("MoveAhead(0.3)", True)]
 
 
-def test_relabelling_and_truncation() -> None:
+def test_relabelling_and_truncation(reader: ProprioMLLM) -> None:
     good = trajectory("a", [("GoTo(Mug_1)", True), ("Pick(left, Mug_1)", True)], "Pick up the mug.", True)
     wrong = trajectory("b", PICK_PLATE, "Pick up the mug.", False)
     plate = "Pick up the plate."
@@ -70,7 +103,7 @@ def test_relabelling_and_truncation() -> None:
     assert list(goals) == [("b", plate)]
     kept = keep([good, wrong], goals, judge, 10)
     assert [(item.goal, item.end, item.relabelled) for item in kept] == [("Pick up the mug.", 2, False), (plate, 3, True)]
-    targets = [example.messages[-1].text for example in actor_examples(kept, "terse", 4)]
+    targets = taught(reader, kept)
     # The failed step is context, not a target, and nothing after the first success is learnt.
     assert targets == ["GoTo(Mug_1)", "Pick(left, Mug_1)", "GoTo(Plate_1)", "Pick(right, Plate_1)"]
     scores = audit([good, wrong], goals, judge)
@@ -93,16 +126,17 @@ def test_duplicates_and_caps() -> None:
     assert len(keep(others, {}, judge, 2)) == 2
 
 
-def test_standing_still_is_not_learnt() -> None:
+def test_standing_still_is_not_learnt(reader: ProprioMLLM) -> None:
     steps = [("GoTo(Mug_1)", False), ("GoTo(Mug_1)", True), ("GoTo(Mug_1)", True), ("MoveUp(0.1)", True), ("MoveUp(0.1)", True)]
-    kept = keep([trajectory("a", steps, "Pick up the mug.", True)], {}, Scripted({("a", 5, "Pick up the mug.")}), 10)
-    targets = [example.messages[-1].text for example in actor_examples(kept, "terse", 4)]
-    assert targets == ["GoTo(Mug_1)", "MoveUp(0.1)", "MoveUp(0.1)"]
+    steps += [("Pick(left, Mug_1)", True)]
+    kept = keep([trajectory("a", steps, "Pick up the mug.", True)], {}, Scripted({("a", 6, "Pick up the mug.")}), 10)
+    targets = taught(reader, kept)
+    assert targets == ["GoTo(Mug_1)", "MoveUp(0.1)", "MoveUp(0.1)", "Pick(left, Mug_1)"]
 
 
 @pytest.fixture
 def demos(shards: Path, cfg: ModelConfig) -> Demos:
-    return Demos(shards / "demos", cfg)
+    return Demos(shards / "lessons", cfg)
 
 
 def test_judging_exercises_have_both_answers(demos: Demos) -> None:

@@ -20,10 +20,10 @@ from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.word_tokens import WordTokens
 from proprio_mllm.planners.words import plans_in_words
-from proprio_mllm.training.critic import Kept, Trajectory, turn_examples
+from proprio_mllm.training.critic import Kept, Trajectory, actor_examples
 from proprio_mllm.training.pipeline import Pipeline, base_model_config
 from proprio_mllm.training.rollouts import read_rollouts
-from proprio_mllm.training.stages import stages_of
+from proprio_mllm.training.stages import STAGES
 from proprio_mllm.training.stages.inputs import episodes_in_words, lesson_folders, lessons_of, turns_of
 from tests.training.test_pipeline import _small, collect, correct
 
@@ -33,13 +33,12 @@ def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
     """Every stage, run once."""
     torch.set_num_threads(1)
     root = tmp_path_factory.mktemp("episodes")
-    overrides = ["budget=debug", f"output={root}", "logger.wandb=disabled", "model.episodes=true", "selu.truth=oracle"]
+    overrides = ["budget=debug", f"output={root}", "logger.wandb=disabled", "selu.truth=oracle"]
     cfg = build(TrainConfig, compose("train", overrides))
     small = dataclasses.replace(cfg, model=_small(cfg.model))
     (root / "tiny").mkdir()
     shutil.copytree(shards, root / "tiny" / "data")
-    shutil.copytree(shards / "demos", root / "tiny" / "data" / "lessons")
-    pipeline = Pipeline(stages_of(small.model), small, collect, "python train.py stage=all", correct, Lessons())
+    pipeline = Pipeline(STAGES, small, collect, "python train.py stage=all", correct, Lessons())
     for stage in pipeline.stages:
         assert pipeline.run(stage) is not None
     return pipeline
@@ -96,7 +95,7 @@ def test_pretrained_weights_read_episodes_as_english(trained: Pipeline, tmp_path
     shutil.rmtree(tmp_path / "tiny" / "data" / "practice")
     model = dataclasses.replace(trained.cfg.model, weights=str(weights))
     given = dataclasses.replace(trained.cfg, output=str(tmp_path), model=model)
-    pipeline = Pipeline(stages_of(model), given, collect, "", None, Lessons())
+    pipeline = Pipeline(STAGES, given, collect, "", None, Lessons())
     done = {stage: pipeline.run(stage) for stage in pipeline.stages}
     assert all(set(done[name] or ()) == {"seconds"} for name in ("words", "practice", "base"))
     assert (done["alignment"] or {})["turns"] > 0
@@ -112,7 +111,7 @@ def test_hindsight_names_the_sub_goal(trained: Pipeline) -> None:
     model, tokens = load_model(trained.paths.model("selu")), MotionTokenizer.load(trained.paths.model("tokenizer"))
     rollout = read_rollouts(trained.paths.stage("selu") / "round_0" / "rollouts")[0]
     motion = tuple(tokens.encode_window(window) for window in rollout.motions)
-    examples = turn_examples(model, [Kept(Trajectory(rollout, motion), "Put the cup on the table.", rollout.length, True)])
+    examples = actor_examples(model, [Kept(Trajectory(rollout, motion), "Put the cup on the table.", rollout.length, True)])
     words, texts = WordTokens(model.processor.tokenizer), list[str]()
     names = {token: word for word, token in words.known.items()}
     for example in examples:

@@ -23,13 +23,13 @@ from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.building import add_adapter, load_model
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.training import release
-from proprio_mllm.training.alignment import PHASES, AlignmentObjective, Exercises
+from proprio_mllm.training.alignment import PHASES, AlignmentObjective
 from proprio_mllm.training.pipeline import Pipeline, StageError, variant_model
 from proprio_mllm.training.rollouts import DaggerRequest, RolloutRequest, read_rollouts, rollout_row
-from proprio_mllm.training.sources import Demos, TextPlanning, shard_hash
+from proprio_mllm.training.sources import Demos, shard_hash
 from proprio_mllm.training.stages import STAGES
 from proprio_mllm.training.stages.alignment import start
-from proprio_mllm.training.stages.inputs import dagger_keys, demonstrations, text_rows
+from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
 from proprio_mllm.training.stages.selu import CRITIC, copy_adapter, train_adapter
 
 HELPERS = importlib.util.spec_from_file_location("training_helpers", Path(__file__).with_name("conftest.py"))
@@ -71,18 +71,14 @@ def collect(request: RolloutRequest) -> None:
 def correct(request: DaggerRequest, workers: int) -> None:
     """Scripted corrections in place of the simulator: a student that is right on every second of its steps."""
     assert workers > 0
-    kind = "demos" if request.kind == "lessons" else request.kind
-    source = ShardReader(request.folder.parent / kind, kind)
+    source = ShardReader(request.folder.parent / "lessons", "demos")
     rows = []
     for number in range(12):
         row = dict(source[number])
-        if request.kind == "text_planning":
-            rows.append({**row, "target": "Lift(Box_1)"})
-            continue
         executed = row["target"] if number % 2 else "MoveAhead(0.5)"
-        note = {"executed": executed, "origin": "student" if number < 8 else "expert"}
-        rows.append({**row, "episode": f"corrected{number // 3}", "privileged": json.dumps(note)})
-    writer = ShardWriter(request.folder, kind, request.config_hash, overwrite=True)
+        note = {"executed": executed, "origin": "student" if number < 8 else "teacher"}
+        rows.append({**row, "episode": f"corrected{number // 4}", "privileged": json.dumps(note)})
+    writer = ShardWriter(request.folder, "demos", request.config_hash, overwrite=True)
     writer.write(0, rows)
     writer.finish({})
 
@@ -96,7 +92,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
     small = dataclasses.replace(cfg, model=_small(cfg.model))
     (root / "tiny").mkdir()
     shutil.copytree(shards, root / "tiny" / "data")
-    shutil.copytree(shards / "demos", root / "tiny" / "data" / "lessons")
     pipeline = Pipeline(STAGES, small, collect, "python train.py stage=all", correct, Lessons())
     for stage in STAGES:
         assert pipeline.run(stage) is not None
@@ -122,25 +117,25 @@ def test_current_stages_are_skipped_and_others_are_not(trained: Pipeline) -> Non
     assert changed.key("base") == trained.key("base")
     assert changed.key("pointmap") != trained.key("pointmap")
     assert changed.key("alignment") != trained.key("alignment")
-    more = dataclasses.replace(trained.cfg.dagger, episodes=5)
-    corrected = Pipeline(STAGES, dataclasses.replace(trained.cfg, dagger=more), collect)
-    assert corrected.key("base") == trained.key("base")
-    assert corrected.key("alignment") != trained.key("alignment")
+    more = dataclasses.replace(trained.cfg.practice, episodes=5)
+    practised = Pipeline(STAGES, dataclasses.replace(trained.cfg, practice=more), collect)
+    assert practised.key("words") == trained.key("words")
+    assert practised.key("base") != trained.key("base")
 
 
 def test_a_new_recipe_makes_older_output_stale(trained: Pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = {name: trained.key(name) for name in ("base", "dagger", "tokenizer", "alignment", "selu")}
+    before = {name: trained.key(name) for name in ("practice", "base", "tokenizer", "alignment", "selu")}
     for name, recipe in {"base": 99, "alignment": 1, "selu": 1}.items():
         monkeypatch.setattr(type(STAGES[name]), "recipe", recipe)
     changed = {name for name in before if trained.key(name) != before[name]}
-    assert changed == {"base", "dagger", "alignment", "selu"}
+    assert changed == {"base", "alignment", "selu"}
 
 
 def test_a_stage_names_what_it_needs(trained: Pipeline, tmp_path: Path) -> None:
     (tmp_path / "tiny").mkdir()
     nothing = Pipeline(STAGES, dataclasses.replace(trained.cfg, output=str(tmp_path)), collect)
     with pytest.raises(ShardError, match=r"no such file.*make them with `python train.py stage=collect`"):
-        nothing.run("base")
+        nothing.run("words")
     (tmp_path / "tiny" / "data").symlink_to(trained.paths.shards("views").parent, target_is_directory=True)
     with pytest.raises(StageError, match=r"'alignment' needs the output of 'base'; run `python train.py stage=base` first"):
         nothing.run("alignment")
@@ -153,47 +148,30 @@ def test_metrics_are_reported(trained: Pipeline) -> None:
     def metrics(stage: str) -> dict[str, float]:
         return json.loads((trained.paths.stage(stage) / "done.json").read_text())["metrics"]
 
-    assert {"side_accuracy", "side_majority", "plan_exact", "text_exact", "base/joint/steps"} <= set(metrics("base"))
-    assert metrics("dagger") | {"seconds": 0} == {
-        "episodes": 4.0, "kept_episodes": 4.0, "steps": 12.0, "student_steps": 8.0, "student_as_expert": 0.5,
-        "text_planning": 10.0, "text_steps": 12.0, "seconds": 0,
-    }  # fmt: skip
+    assert {"side_accuracy", "side_majority", "turn_exact", "held_out_exact", "base/joint/steps"} <= set(metrics("base"))
+    assert {"own_steps": 8.0, "own_as_teacher": 0.5}.items() <= metrics("practice").items()
     assert metrics("pointmap")["point_median_m"] > 0.0
     assert {"clips_mpjpe_mm", "clips_hands_mm", "clips_feet_mm", "bits_per_s", "codes_used", "perplexity"} <= set(
         metrics("tokenizer")
     )
-    assert {"arm_accuracy", "shift_accuracy", "plan_exact"} <= set(metrics("alignment"))
+    assert {"arm_accuracy", "shift_accuracy", "turn_exact"} <= set(metrics("alignment"))
 
 
-def test_corrections_follow_the_demonstrations(trained: Pipeline) -> None:
+def test_own_episodes_follow_the_teachers(trained: Pipeline) -> None:
     model = trained.cfg.model
-    alone, joined = Demos(trained.paths.shards("demos"), model), demonstrations(trained, model)
+    alone, joined = Demos(trained.paths.shards("lessons"), model), lessons_of(trained, model)
     count = len(alone.motions)
     assert len(joined.motions) == count + 12
-    assert [joined.target(i) for i in (0, count - 1)] == [alone.target(i) for i in (0, count - 1)]
-    assert [joined.target(count + i) for i in range(12)] == [alone.target(i) for i in range(12)]
+    targets = joined.reader.column("target")
+    assert targets[:count] == alone.reader.column("target")
+    assert targets[count:] == targets[:12]
+    assert all(targets[int(i)] == "Done()" for i in joined.finals)
     assert {joined.reader[i]["episode"] for i in joined.finals} > {alone.reader[i]["episode"] for i in alone.finals}
-    none = dataclasses.replace(trained.cfg, dagger=dataclasses.replace(trained.cfg.dagger, episodes=0))
-    assert len(demonstrations(Pipeline(STAGES, none), model).motions) == count
-    assert list(dagger_keys(Pipeline(STAGES, none))) == ["dagger_in_text"]
-
-
-def test_half_of_the_steps_in_words_are_corrections(trained: Pipeline) -> None:
-    model, rng = trained.cfg.model, np.random.default_rng(0)
-    demos = Demos(trained.paths.shards("demos"), model)
-
-    def answers(text_planning: TextPlanning) -> list[str]:
-        return [text_planning.draw(rng).messages[-1].text for _ in range(200)]
-
-    assert 70 < answers(text_rows(trained, model, demos)).count("Lift(Box_1)") < 130
-    assert answers(TextPlanning(trained.paths.shards("text_planning"), model, demos)).count("Lift(Box_1)") < 10
-    alone = dataclasses.replace(trained.cfg, dagger=dataclasses.replace(trained.cfg.dagger, text_planning=0))
-    assert Pipeline(STAGES, alone).key("alignment") != trained.key("alignment")
-    assert dagger_keys(Pipeline(STAGES, alone))["dagger"] == dagger_keys(trained)["dagger"]
 
 
 def test_the_control_trains_without_motion(trained: Pipeline) -> None:
-    control = Pipeline(STAGES, dataclasses.replace(trained.cfg, variant="no_proprio"), collect)
+    cfg = dataclasses.replace(trained.cfg, variant="no_proprio")
+    control = Pipeline(STAGES, cfg, collect, lessons=Lessons())
     assert control.run("alignment") is not None
     assert control.run("selu") is not None
     model = load_model(control.paths.model("selu"))
@@ -227,15 +205,14 @@ def test_a_phase_changes_only_its_groups(trained: Pipeline, phase: str) -> None:
     from proprio_mllm.model.groups import group_of
     from proprio_mllm.model.motion_tokenizer import MotionTokenizer
     from proprio_mllm.training.alignment import AlignmentData
-    from proprio_mllm.training.sources import Clips, GoalQuestions, TextPlanning, Views
+    from proprio_mllm.training.sources import Clips, Views
 
     model = start(trained)
     shards, cfg = trained.paths.shards, trained.cfg.alignment
     tokenizer = MotionTokenizer.load(trained.paths.model("tokenizer"))
-    views, demos = Views(shards("views"), model.cfg), Demos(shards("demos"), model.cfg)
-    text_planning = TextPlanning(shards("text_planning"), model.cfg, demos)
-    goal_questions = GoalQuestions(shards("goal_questions"), model.cfg)
-    data = AlignmentData(model, tokenizer, Clips(shards("clips")), views, demos, Exercises(text_planning, goal_questions), cfg)
+    views, demos = Views(shards("views"), model.cfg), lessons_of(trained, model.cfg)
+    turns, words = turns_of(trained, model, demos, tokenizer), episodes_in_words(trained, model, "test/words")
+    data = AlignmentData(model, tokenizer, Clips(shards("clips")), views, demos, turns, words, cfg)
     train_only(model, PHASES[phase].groups)
     before = {name: tensor.detach().clone() for name, tensor in model.named_parameters()}
     trained.loop(AlignmentObjective(model, data, phase, cfg, "test"), cfg.joint, trained.paths.root / f"groups-{phase}")
@@ -274,12 +251,12 @@ def test_the_same_seed_gives_the_same_weights(trained: Pipeline, shards: Path, t
     """Initial weights included: whatever was drawn before, here a number, makes no difference."""
     torch.manual_seed(12345)
     shutil.copytree(shards, tmp_path / "tiny" / "data")
-    again = Pipeline(STAGES, dataclasses.replace(trained.cfg, output=str(tmp_path)), collect, "", correct)
-    for stage in ("base", "dagger", "pointmap", "tokenizer", "alignment"):
+    again = Pipeline(STAGES, dataclasses.replace(trained.cfg, output=str(tmp_path)), collect, "", correct, Lessons())
+    for stage in ("words", "practice", "base", "pointmap", "tokenizer", "alignment"):
         again.run(stage)
         torch.rand(1)
     files = [path.relative_to(tmp_path) for path in sorted((tmp_path / "tiny").rglob("*.safetensors"))]
-    assert {path.parts[2] for path in files} == {"base", "pointmap", "tokenizer", "alignment"}
+    assert {path.parts[2] for path in files} == {"words", "practice", "base", "pointmap", "tokenizer", "alignment"}
     for path in files:
         ours, theirs = load_file(tmp_path / path), load_file(Path(trained.cfg.output) / path)
         assert ours.keys() == theirs.keys()
@@ -307,10 +284,9 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     written = release.export(trained, tmp_path)
     assert [folder.name for folder in written] == ["words", "base", "full"]
     about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
-    assert list(about["stages"]) == ["base", "dagger", "pointmap", "tokenizer", "alignment", "selu"]
+    assert list(about["stages"]) == ["words", "practice", "base", "pointmap", "tokenizer", "alignment", "selu"]
     assert all(stage["command"] == "python train.py stage=all" and stage["metrics"] for stage in about["stages"].values())
-    kinds = ("clips", "views", "text_planning", "goal_questions", "demos", "dagger", "dagger_in_text", "lessons", "practice")
-    assert set(about["shards"]) == set(kinds)
+    assert set(about["shards"]) == {"clips", "views", "lessons", "practice"}
     ours, released = load_model(trained.paths.model("selu")), load_model(tmp_path / "tiny" / "full")
     theirs = dict(released.named_parameters())
     assert all(tensor.dtype == torch.float32 for tensor in theirs.values())
@@ -371,11 +347,11 @@ def test_wrong_overrides_name_what_is_allowed(override: str, message: str) -> No
 
 
 class _Counting:
-    """A stage of one's own: counts the rows of the demonstrations."""
+    """A stage of one's own: counts the rows of the lessons."""
 
     name = "counting"
     needs = ("base",)
-    shards = ("demos",)
+    shards = ("lessons",)
     recipe = 1
 
     def settings(self, pipeline: Pipeline) -> dict[str, int]:
@@ -383,14 +359,14 @@ class _Counting:
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> dict[str, float]:
         assert folder.name == "counting" and key == pipeline.key("counting")
-        return {"rows": float(len(ShardReader(pipeline.paths.shards("demos"), "demos")))}
+        return {"rows": float(len(ShardReader(pipeline.paths.shards("lessons"), "demos")))}
 
 
 def test_a_stage_of_ones_own_is_one_class_and_one_entry(trained: Pipeline, tmp_path: Path) -> None:
     shutil.copytree(trained.cfg.output, tmp_path / "run")
     cfg = dataclasses.replace(trained.cfg, output=str(tmp_path / "run"))
     pipeline = Pipeline({**STAGES, "counting": _Counting()}, cfg)
-    assert pipeline.ancestors("counting") == ("base", "counting")
+    assert pipeline.ancestors("counting") == ("words", "practice", "base", "counting")
     metrics = pipeline.run("counting")
     assert metrics is not None and metrics["rows"] > 0
     assert pipeline.run("counting") is None

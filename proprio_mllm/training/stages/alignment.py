@@ -13,23 +13,24 @@ from proprio_mllm.model.building import add_adapter, build_model, build_point_ma
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, Episodes, Exercises, body_state_accuracy
-from proprio_mllm.training.base import grounding_accuracy, plan_accuracy, text_accuracy
+from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, body_state_accuracy
+from proprio_mllm.training.base import grounding_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded, variant_model
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, GoalQuestions, Views
-from proprio_mllm.training.stages.inputs import demonstrations, episodes_in_words, lessons_of, text_rows, turns_of
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
+from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
 from proprio_mllm.training.turns import turn_accuracy
+from proprio_mllm.training.words import held_out_metrics
 
-__all__ = ["AlignmentStage", "EpisodeAlignmentStage", "start"]
+__all__ = ["AlignmentStage", "start"]
 
 
 class AlignmentStage:
     """The phases of `PHASES`, each a loop over its own parameter groups."""
 
     name = "alignment"
-    needs = ("base", "dagger", "pointmap", "tokenizer")
-    shards = ("goal_questions",)
-    recipe = 5
+    needs = ("base", "practice", "pointmap", "tokenizer")
+    shards = ("lessons",)
+    recipe = 6
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The phases and the variant's model."""
@@ -42,8 +43,10 @@ class AlignmentStage:
         model = start(pipeline)
         tokenizer = MotionTokenizer.load(pipeline.paths.model("tokenizer"))
         views, clips = Views(pipeline.paths.shards("views"), model.cfg), Clips(pipeline.paths.shards("clips"))
-        rows = self.rows(pipeline, model, tokenizer, key)
-        data = AlignmentData(model, tokenizer, clips, views, *rows, pipeline.cfg.alignment)
+        read = tokenizer if model.cfg.proprioception else None
+        demos = lessons_of(pipeline, model.cfg)
+        turns, words = turns_of(pipeline, model, demos, read), episodes_in_words(pipeline, model, f"{key}/words")
+        data = AlignmentData(model, tokenizer, clips, views, demos, turns, words, pipeline.cfg.alignment)
         # without proprioception there is nothing to align apart
         wanted = PHASES if model.cfg.proprioception else ("joint",)
         loops = {phase: getattr(pipeline.cfg.alignment, phase) for phase in wanted}
@@ -52,54 +55,16 @@ class AlignmentStage:
             pipeline.loop(
                 AlignmentObjective(model, data, phase, pipeline.cfg.alignment, f"{key}/{phase}"), loop, folder / phase
             )
-        read = tokenizer if model.cfg.proprioception else None
         save_model(model.eval(), pipeline.paths.model("alignment"), read)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
-        felt = body_state_accuracy(model, data.demos, read) if read is not None else {}
-        return {**asked, **felt, **self.planning(model, data, read)}
-
-    def rows(
-        self, pipeline: Pipeline, model: ProprioMLLM, tokenizer: MotionTokenizer, key: str
-    ) -> tuple[Demos, Exercises | Episodes]:
-        """Steps with pictures and motion, and what is asked in words."""
-        del tokenizer, key
-        demos = demonstrations(pipeline, model.cfg)
-        questions = GoalQuestions(pipeline.paths.shards("goal_questions"), model.cfg)
-        return demos, Exercises(text_rows(pipeline, model.cfg, demos), questions)
-
-    def planning(self, model: ProprioMLLM, data: AlignmentData, read: MotionTokenizer | None) -> Metrics:
-        """How often a held-out step is the teacher's."""
-        assert isinstance(data.told, Exercises)
-        return {**plan_accuracy(model, data.demos, read), **text_accuracy(model, data.told.text_planning, data.bodies)}
-
-
-class EpisodeAlignmentStage(AlignmentStage):
-    """The same where whole episodes are read."""
-
-    needs = ("base", "practice", "pointmap", "tokenizer")
-    shards = ("lessons",)
-    recipe = 0
-
-    def rows(
-        self, pipeline: Pipeline, model: ProprioMLLM, tokenizer: MotionTokenizer, key: str
-    ) -> tuple[Demos, Exercises | Episodes]:
-        """Steps with pictures and motion, and episodes."""
-        demos = lessons_of(pipeline, model.cfg)
-        turns = turns_of(pipeline, model, demos, tokenizer if model.cfg.proprioception else None)
-        return demos, Episodes(turns, episodes_in_words(pipeline, model, f"{key}/words"))
-
-    def planning(self, model: ProprioMLLM, data: AlignmentData, read: MotionTokenizer | None) -> Metrics:
-        """How often a held-out answer is the teacher's."""
-        del read
-        assert isinstance(data.told, Episodes)
-        return turn_accuracy(model, data.told.turns)
+        felt = body_state_accuracy(model, demos, read) if read is not None else {}
+        told = {} if pipeline.lessons is None else held_out_metrics(model, {"": pipeline.lessons.episode})
+        return {**asked, **felt, **turn_accuracy(model, turns), **told}
 
 
 def start(pipeline: Pipeline) -> ProprioMLLM:
     """The base model with this variant's MPE and CSE and the trained point map."""
-    cfg = variant_model(pipeline.cfg.model, pipeline.cfg.variant)
-    if cfg.episodes:
-        cfg = dataclasses.replace(cfg, sees=True)
+    cfg = dataclasses.replace(variant_model(pipeline.cfg.model, pipeline.cfg.variant), episodes=True, sees=True)
     point_map = None
     if cfg.cse.enabled:
         point_map = seeded(lambda: build_point_map(cfg), pipeline.cfg.seed)

@@ -1,4 +1,4 @@
-"""Stage `base`: the plain backbone learns to see and to plan; stands in for the pretraining of Qwen2.5-VL."""
+"""Stage `base`: the language model of `practice` learns to see; stands in for the pretraining of Qwen2.5-VL."""
 
 from __future__ import annotations
 
@@ -12,70 +12,30 @@ from proprio_mllm.model.dense import DenseHead
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.word_tokens import add_word_tokens
 from proprio_mllm.model.wording import id_words
-from proprio_mllm.training.base import (
-    DenseObjective,
-    EpisodeObjective,
-    JointObjective,
-    grounding_accuracy,
-    plan_accuracy,
-    text_accuracy,
-)
+from proprio_mllm.training.base import DenseObjective, JointObjective, grounding_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError, base_model_config, seeded
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, TextPlanning, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
 from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
 from proprio_mllm.training.text import adopt, corpus, start_from_words, whole_words
 from proprio_mllm.training.turns import turn_accuracy
 from proprio_mllm.training.words import held_out_metrics
 
-__all__ = ["BaseStage", "EpisodeBaseStage"]
+__all__ = ["BaseStage"]
 
 
 class BaseStage:
-    """Dense grounding first, then grounding, planning and text together, all weights training."""
+    """Dense grounding of the tower first, then grounding and planning together, all weights training."""
 
     name = "base"
-    needs = ()
-    shards = ("views", "text_planning", "demos", "clips")
-    recipe = 3
+    needs = ("practice",)
+    shards = ("views", "lessons", "clips")
+    recipe = 4
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """Of the tokenizer only the words: no stage before it, and no motion in its prompts."""
         model = pipeline.cfg.model
         plain = dataclasses.asdict(base_model_config(model)) | {"motion": model.motion.vocabulary}
         return {"base": dataclasses.asdict(pipeline.cfg.base), "model": plain}
-
-    def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
-        """Trains and stores the base model; nothing to do where pretrained weights are given."""
-        cfg, plain = pipeline.cfg, base_model_config(pipeline.cfg.model)
-        if pipeline.needs_no(self.name):
-            return {}
-        views, demos = Views(pipeline.paths.shards("views"), plain), Demos(pipeline.paths.shards("demos"), plain)
-        clips = Clips(pipeline.paths.shards("clips"))
-        text_planning = TextPlanning(pipeline.paths.shards("text_planning"), plain, demos)
-        texts = corpus(plain, views, demos, text_planning, clips, cfg.seed)
-        model = build_model(plain, build_processor(plain, texts, whole_words(views)), cfg.seed)
-        start_from_words(model, views.type_names)
-        head = seeded(lambda: DenseHead(model, views.type_names), cfg.seed)
-        model.requires_grad_(True)
-        dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
-        chosen = {id(p) for p in train_only(model, ("vision", "merger", "rows"))} | {id(p) for p in head.parameters()}
-        for parameter in dense.module.parameters():
-            parameter.requires_grad_(id(parameter) in chosen)
-        pipeline.loop(dense, cfg.base.dense, folder / "dense")
-        model.requires_grad_(True)
-        joint = JointObjective(model, head, views, demos, text_planning, clips, cfg.base, f"{key}/joint")
-        pipeline.loop(joint, cfg.base.joint, folder / "joint")
-        save_model(model.eval(), pipeline.paths.model("base"))
-        asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE))
-        return {**asked, **plan_accuracy(model, demos), **text_accuracy(model, text_planning)}
-
-
-class EpisodeBaseStage(BaseStage):
-    """The same where whole episodes are read: the language model is that of `practice`, and learns to see."""
-
-    needs = ("practice",)
-    shards = ("views", "lessons", "clips")
-    recipe = 0
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
         """Trains and stores the base model; nothing to do where pretrained weights are given."""
@@ -87,7 +47,7 @@ class EpisodeBaseStage(BaseStage):
         plain = dataclasses.replace(base_model_config(cfg.model), episodes=True, sees=True)
         views, clips = Views(pipeline.paths.shards("views"), plain), Clips(pipeline.paths.shards("clips"))
         demos = lessons_of(pipeline, plain)
-        processor = build_processor(plain, corpus(plain, views, None, None, clips, cfg.seed), whole_words(views))
+        processor = build_processor(plain, corpus(plain, views, clips, cfg.seed), whole_words(views))
         add_word_tokens(processor.tokenizer, lessons.words())
         model = build_model(plain, processor, cfg.seed)
         adopt(model, load_model(pipeline.paths.model("practice")))
@@ -101,7 +61,7 @@ class EpisodeBaseStage(BaseStage):
         pipeline.loop(dense, cfg.base.dense, folder / "dense")
         model.requires_grad_(True)
         turns, words = turns_of(pipeline, model, demos), episodes_in_words(pipeline, model, f"{key}/words")
-        joint = EpisodeObjective(model, head, views, turns, demos, clips, words, cfg.base, f"{key}/joint")
+        joint = JointObjective(model, head, views, turns, demos, clips, words, cfg.base, f"{key}/joint")
         pipeline.loop(joint, cfg.base.joint, folder / "joint")
         save_model(model.eval(), pipeline.paths.model("base"))
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE))

@@ -49,7 +49,6 @@ class PracticeStage:
         request = DaggerRequest(
             student,
             shards,
-            "lessons",
             cfg.episodes,
             pipeline.cfg.seed,
             cfg.teacher_share,

@@ -38,16 +38,13 @@ from proprio_mllm.training.critic import (
     audit,
     critic_examples,
     keep,
-    turn_examples,
 )
 from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.goals import Relabel
 from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.pipeline import Metrics, Pipeline
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
-from proprio_mllm.training.sources import Bodies, GoalQuestions
-from proprio_mllm.training.stages.inputs import demonstrations, lessons_of, text_rows, turns_of
-from proprio_mllm.training.turns import Turns
+from proprio_mllm.training.stages.inputs import lessons_of, turns_of
 
 __all__ = ["ACTOR", "CRITIC", "ExampleObjective", "SeluStage", "copy_adapter", "train_adapter"]
 
@@ -55,8 +52,6 @@ logger = logging.getLogger(__name__)
 
 #: Adapter names; the actor's is the one that stage 2 trained.
 ACTOR, CRITIC = "default", "critic"
-#: Share of the critic's practice that is in words alone; the rest is about the expert's logs and pictures.
-IN_WORDS = 0.5
 
 
 class ExampleObjective:
@@ -152,34 +147,15 @@ class _Selu:
             add_adapter(self.model, CRITIC)
             copy_adapter(self.model, ACTOR, CRITIC)
         self.collator = Collator(self.model.processor, self.model.cfg)
-        cfg, paths = self.model.cfg, self.pipeline.paths
-        self.turns: Turns | None = None
-        if cfg.episodes:
-            self.demos = lessons_of(self.pipeline, cfg)
-            self.turns = turns_of(self.pipeline, self.model, self.demos, self.tokenizer)
-        else:
-            self.demos = demonstrations(self.pipeline, cfg)
-            self.goal_questions = GoalQuestions(paths.shards("goal_questions"), cfg)
-            self.text_planning = text_rows(self.pipeline, cfg, self.demos)
+        self.demos = lessons_of(self.pipeline, self.model.cfg)
+        self.turns = turns_of(self.pipeline, self.model, self.demos, self.tokenizer)
         self._tokens = None if self.tokenizer is None else self.demos.tokens(self.tokenizer)
-        self._bodies = None if self._tokens is None else Bodies(self.demos, self._tokens)
-
-    def _codes(self, index: int) -> list[int] | None:
-        return None if self._tokens is None else self._tokens[index].tolist()
 
     def _judging(self, rng: np.random.Generator) -> Example:
-        if self.turns is None and rng.random() < IN_WORDS:
-            return self.goal_questions.draw(rng)
-        index = int(self.demos.draw(rng, 1)[0])
-        return judge_example(self.demos, index, rng, self._tokens)
+        return judge_example(self.demos, int(self.demos.draw(rng, 1)[0]), rng, self._tokens)
 
     def _planning(self, rng: np.random.Generator) -> Example:
-        if self.turns is not None:
-            return self.turns.draw(rng, 1)[0]
-        if rng.random() < self.pipeline.cfg.alignment.text_share:
-            return self.text_planning.draw(rng, self._bodies)
-        index = int(self.demos.draw(rng, 1)[0])
-        return self.demos.example(index, self._codes(index))
+        return self.turns.draw(rng, 1)[0]
 
     def tune(self, adapter: str, name: str, examples: Sequence[Example], loop: LoopConfig, share: float, folder: Path) -> None:
         """Fine-tunes one adapter."""
@@ -207,7 +183,7 @@ class _Selu:
         self.load(before)
         if number == 0:
             self.tune(CRITIC, "selu/practice", [], self.cfg.critic, 1.0, folder / "practice")
-        style, last = self.model.cfg.prompt, self.model.cfg.history
+        style = self.model.cfg.prompt
         trajectories = _trajectories(read_rollouts(request.folder), self.tokenizer)
         if not trajectories:
             raise ValueError(f"{request.folder}: the collector wrote no episode")
@@ -222,7 +198,7 @@ class _Selu:
         )
         kept = keep(trajectories, goals, judge, self.cfg.per_class)
         metrics |= {f"after_{name}": value for name, value in audit(trajectories, goals, judge).items()}
-        steps = turn_examples(self.model, kept) if self.turns is not None else actor_examples(kept, style, last)
+        steps = actor_examples(self.model, kept)
         metrics |= {
             "episodes": float(len(trajectories)),
             "actor_success": float(np.mean([t.rollout.success for t in trajectories])),
@@ -238,12 +214,12 @@ class _Selu:
 
 
 class SeluStage:
-    """Rounds of acting, judging, relabelling and learning; the model says whether it reads whole episodes."""
+    """Rounds of acting, judging, relabelling and learning."""
 
     name = "selu"
     needs = ("alignment",)
     shards = ()
-    recipe = 4
+    recipe = 5
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The rounds."""

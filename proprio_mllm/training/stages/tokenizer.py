@@ -24,8 +24,8 @@ class TokenizerStage:
 
     name = "tokenizer"
     needs = ()
-    shards = ("clips", "views", "demos")
-    recipe = 2
+    shards = ("clips", "views", "lessons")
+    recipe = 3
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The loop, the codec and the weights of its features."""
@@ -38,10 +38,9 @@ class TokenizerStage:
         motion = pipeline.cfg.model.motion
         clips = Clips(pipeline.paths.shards("clips"))
         recorded = []
-        for kind in ("views", "demos"):
-            rows = [
-                decode_motion(row)[-motion.window :] for row in ShardReader(pipeline.paths.shards(kind), kind).column("motion")
-            ]
+        for name, kind in (("views", "views"), ("lessons", "demos")):
+            reader = ShardReader(pipeline.paths.shards(name), kind)
+            rows = [decode_motion(row)[-motion.window :] for row in reader.column("motion")]
             recorded.append(np.stack(rows) if rows else np.zeros((0, motion.window, motion.features), dtype=np.float32))
         windows = MotionWindows(clips, recorded, motion.window)
         tokenizer = seeded(lambda: MotionTokenizer(motion), pipeline.cfg.seed)
