@@ -15,7 +15,7 @@ QUICK := tests/configs tests/data/interface tests/model tests/planners tests/rep
   $(addprefix --ignore=tests/,$(addprefix report/test_,export.py figures.py notebook.py reconstruction.py tokenizer.py video.py) \
   $(addprefix planners/,chat/dag_plan/test_episode.py scripted/test_planner.py test_released.py))
 
-.PHONY: setup eval test test-slow quick check release-check serve motions lock pictures third-party clean
+.PHONY: setup eval test test-slow quick check release-check serve motions lock pictures docs third-party clean
 
 setup: $(STAMP)
 
@@ -65,11 +65,16 @@ lock: $(STAMP)
 	$(BIN)/python tools/lock.py > requirements.lock.tmp && mv requirements.lock.tmp requirements.lock
 
 clean:
-	rm -rf $(VENV) outputs
+	rm -rf $(VENV) outputs site
 
 # The pictures of rooms and robots in the docs, and the film of the README.
 pictures: $(STAMP)
 	$(BIN)/python tools/pictures.py
+
+# The documentation as a site that opens from its folder: site/index.html. Links that lead nowhere are errors.
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint requirements.lock --editable ".[docs]"
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 third-party: $(STAMP)
 	$(BIN)/python tools/third_party.py > THIRD_PARTY.md

@@ -170,7 +170,8 @@ class Controller(Stopped):
     Args:
         robot_type: robot name.
         scene: room name.
-        width, height: size of the frames.
+        width: of the frames, pixels.
+        height: likewise.
         difficulty: easy, medium, hard or natural.
         seed: key of the trial's luck.
         third_party_cameras: names of `sim.world.rendering.CAMERAS` drawn with every event.
