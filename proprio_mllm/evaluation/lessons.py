@@ -212,7 +212,7 @@ class _Record:
         if not self._turns:
             self._prefix = prefix_words(shown)
         else:
-            taken = log_words(shown.history[-1], self._sightings.new)
+            taken = log_words(shown.history[-1:], self._sightings.new)
             self._turns[-1] = replace(self._turns[-1], taken=taken)
         actions = tuple(
             one if one.object_id is None else replace(one, object_id=self._id(one.object_id)) for one in step.actions

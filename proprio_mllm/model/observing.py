@@ -32,19 +32,22 @@ class EpisodeLog:
         words: the episode's tokens.
         sightings: what has been seen, and what the log says.
         log: tokens of prefix and log.
+        told: how many steps are in the log.
     """
 
     words: Tokens
     sightings: Sightings = field(default_factory=Sightings)
     log: list[int] = field(default_factory=list)
+    told: int = 0
 
     def look(self, observation: Seen) -> list[int]:
-        """Takes in an observation; the tokens of the state, which follow the log."""
+        """Takes in an observation, at most one step after the last; the tokens of the state, which follow the log."""
         self.sightings.look(observation)
         if not self.log:
             self.log = self.words.tokens(prefix_words(observation))
-        elif observation.history:
-            self.log += self.words.tokens(log_words(observation.history[-1], self.sightings.new))
+        else:
+            self.log += self.words.tokens(log_words(observation.history[self.told :], self.sightings.new))
+        self.told = len(observation.history)
         return self.words.tokens(state_words(self.sightings))
 
 

@@ -134,10 +134,11 @@ def prefix_words(seen: Seen) -> Words:
     return (seen.robot, *text_words(seen.instruction), "room", *listed)
 
 
-def log_words(item: HistoryItem, new: Sequence[str]) -> Words:
-    """A step with its codes, and what came into view after it."""
-    words = ["did"]
-    for events in events_of([item]):
+def log_words(steps: Sequence[HistoryItem], new: Sequence[str]) -> Words:
+    """A step with its codes, or none, and what came into view after it."""
+    words: list[str] = []
+    for events in events_of(steps):
+        words.append("did")
         for event in events:
             words += [*_action_words(event.action), event.code]
     if new:

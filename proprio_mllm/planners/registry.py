@@ -25,7 +25,7 @@ from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 __all__ = ["CHAT_PLANNERS", "PLANNERS", "make_chat_planner", "make_planner"]
 
 #: Fields of planners of kind `mllm` that one of its two forms would ignore.
-_OF_PROMPTS: Final = ("adapter", "max_new_tokens", "reflection")
+_OF_PROMPTS: Final = ("max_new_tokens",)
 _OF_EPISODES: Final = ("insist",)
 
 
@@ -40,7 +40,8 @@ def _mllm(cfg: PlannerConfig) -> Planner:
         reads = "whole episodes" if whole else "a prompt of its own at every step"
         require(value == default, f"planner.{name} {value!r} with {cfg.weights}, which reads {reads}; allowed: {default!r}")
     if whole:
-        return WordsPlanner.load(cfg.weights, cfg.temperature, cfg.train, cfg.insist)
+        reflects = cfg.reflection == "on"
+        return WordsPlanner.load(cfg.weights, cfg.temperature, cfg.train, cfg.insist, cfg.adapter, reflects)
     return MllmPlanner.load(
         cfg.weights, cfg.adapter, cfg.temperature, cfg.max_new_tokens, cfg.train, reflection=cfg.reflection == "on"
     )

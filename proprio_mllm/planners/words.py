@@ -24,7 +24,7 @@ from transformers import DynamicCache
 from data.interface.effects import Walk
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
-from data.interface.sightings import Seen
+from data.interface.sightings import Seen, Shown
 from data.interface.steps import PlanStep
 from data.interface.symbolic import events_of
 from proprio_mllm.model.batch import Collator, Example
@@ -36,7 +36,7 @@ from proprio_mllm.model.observing import EpisodeLog, turn_example
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import Words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
-from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights
+from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights, succeeded
 
 __all__ = ["WordsPlanner", "WordsState", "plans_in_words"]
 
@@ -63,9 +63,9 @@ class WordsState(EpisodeLog):
 
     def look(self, observation: Seen) -> list[int]:
         """As the log does; counts what was refused."""
-        begun = bool(self.log)
+        known = self.told
         now = EpisodeLog.look(self, observation)
-        if begun and observation.history:
+        if self.told > known:
             self._count(observation)
         return now
 
@@ -88,14 +88,21 @@ class WordsPlanner:
         motion: the motion tokenizer; needed when the model sees and its answers stand after motion tokens.
         temperature: 0 takes the most likely word.
         insist: whether steps may be taken that are bound to bring nothing (`AnswerGrammar`), or were refused twice.
+        reflection: whether failed steps are in the log.
     """
 
     privileged = False
 
     def __init__(
-        self, model: ProprioMLLM, motion: MotionTokenizer | None = None, temperature: float = 0.0, insist: bool = False
+        self,
+        model: ProprioMLLM,
+        motion: MotionTokenizer | None = None,
+        temperature: float = 0.0,
+        insist: bool = False,
+        reflection: bool = True,
     ) -> None:
         self.model, self.motion, self.temperature, self.insist = model, motion, temperature, insist
+        self.reflection = reflection
         self.image_size = model.cfg.image_size if model.cfg.sees else 0
         self._tokenizer = model.processor.tokenizer
         self._collator = Collator(model.processor, model.cfg)
@@ -103,15 +110,30 @@ class WordsPlanner:
         self._pad = int(self._tokenizer.pad_token_id)
 
     @staticmethod
-    def load(folder: str | Path, temperature: float = 0.0, train: str = "", insist: bool = False) -> WordsPlanner:
+    def load(
+        folder: str | Path,
+        temperature: float = 0.0,
+        train: str = "",
+        insist: bool = False,
+        adapter: str | None = None,
+        reflection: bool = True,
+    ) -> WordsPlanner:
         """Reads a stored model.
 
+        Args:
+            folder: what `save_model` wrote.
+            temperature: see the class.
+            train: command that makes the weights, for the message when they are absent.
+            insist: see the class.
+            adapter: adapter to activate; None takes the first.
+            reflection: see the class.
+
         Raises:
-            WeightsError: when the folder has no model; the message names `train`, the command that makes it.
+            WeightsError: when the folder has no model.
         """
-        model = load_model(check_weights(folder, train))
+        model = load_model(check_weights(folder, train), adapter)
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        return WordsPlanner(model.to(device), load_motion(folder), temperature, insist)
+        return WordsPlanner(model.to(device), load_motion(folder), temperature, insist, reflection)
 
     def begin(self, task: TaskInfo, rng: np.random.Generator) -> WordsState:
         """The state of a new episode."""
@@ -147,7 +169,7 @@ class WordsPlanner:
         return replies
 
     def _answer(self, observation: Seen, state: WordsState) -> _Answer:
-        now = state.look(observation)
+        now = state.look(observation if self.reflection else without_failures(observation))
         seen = observation if isinstance(observation, Observation) else None
         turn = turn_example(self.model, state.log, now, seen, self.motion)
         return _Answer(AnswerGrammar(observation.known_objects, None if self.insist else state.sightings.belief), state, turn)
@@ -166,6 +188,13 @@ class WordsPlanner:
         if state is not None:
             state.cached = len(state.log)
             state.cache.crop(state.cached - state.cache.get_seq_length())  # minus what is no log
+
+
+def without_failures(observation: Seen) -> Seen:
+    """What was seen, with the failed steps taken out of its log."""
+    kept = tuple(item for item in observation.history if succeeded(item))
+    names = observation.visible_objects, observation.known_objects
+    return Shown(observation.instruction, observation.robot, *names, kept)
 
 
 def plans_in_words(folder: str | Path) -> bool:

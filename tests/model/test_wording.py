@@ -36,9 +36,10 @@ def test_the_start() -> None:
 
 def test_a_step_of_the_log() -> None:
     item = HistoryItem("Pick(left, Mug_1) & Open(right, Fridge_2)", "Pick(left, Mug_1) ok; Open(right, Fridge_2) BodyTooHigh")
-    assert " ".join(log_words(item, ("Egg_1",))) == "did Pick left mug _1 ok Open right fridge _2 BodyTooHigh see egg _1"
+    assert " ".join(log_words([item], ("Egg_1",))) == "did Pick left mug _1 ok Open right fridge _2 BodyTooHigh see egg _1"
     walk = HistoryItem("GoTo(Mug_1, auto, -20)", "GoTo(Mug_1, auto, -20) NoFreePose")
-    assert " ".join(log_words(walk, ())) == "did GoTo mug _1 auto -20d NoFreePose"
+    assert " ".join(log_words([walk], ())) == "did GoTo mug _1 auto -20d NoFreePose"
+    assert log_words((), ("Egg_1",)) == ("see", "egg", "_1")
 
 
 def test_what_is_known_now() -> None:

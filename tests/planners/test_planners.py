@@ -98,9 +98,7 @@ def test_registry() -> None:
 @pytest.mark.parametrize(
     ("weights", "settings", "allowed"),
     [
-        ("words", {"reflection": "off"}, "reads whole episodes; allowed: 'on'"),
         ("words", {"max_new_tokens": 20}, "reads whole episodes; allowed: 48"),
-        ("words", {"adapter": "base"}, "reads whole episodes; allowed: None"),
         ("base", {"insist": True}, "reads a prompt of its own at every step; allowed: False"),
     ],
 )

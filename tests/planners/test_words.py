@@ -182,6 +182,22 @@ def test_what_has_been_read_is_not_read_again(planner: WordsPlanner) -> None:
         episode.take(reply.step)
 
 
+def test_without_reflection_failed_steps_are_not_in_the_log(planner: WordsPlanner) -> None:
+    shown, blind = WordsOnly(3).shown(), WordsPlanner(planner.model, reflection=False)
+    lines = ("GoTo(Mug_1) ok", "Pick(left, Mug_1) TooFar", "Pick(right, Mug_1) ok")
+    history = tuple(HistoryItem(line.rsplit(" ", 1)[0], line) for line in lines)
+    states = {one: begin(one) for one in (planner, blind)}
+    for count in range(len(lines) + 1):
+        for one, state in states.items():
+            one.step_batch([dataclasses.replace(shown, history=history[:count])], [state])
+    names = {token: word for word, token in states[planner].words.known.items()}  # type: ignore[attr-defined]
+    told = {one: [names.get(token) for token in state.log] for one, state in states.items()}
+    assert told[planner].count("did") == 3
+    assert told[blind].count("did") == 2
+    assert "TooFar" in told[planner] and "TooFar" not in told[blind]
+    assert not states[blind].sightings.belief.fails and states[blind].sightings.belief.state.holds("Mug_1")
+
+
 def test_temperature_draws_from_the_episodes_generator(planner: WordsPlanner) -> None:
     hot = WordsPlanner(planner.model, temperature=2.0)
     shown = WordsOnly(9).shown()
