@@ -52,7 +52,7 @@ check: $(STAMP)
 release-check: $(STAMP)
 	$(BIN)/python -m sim benchmark release=true
 
-# The released tiny base model behind OpenAI's chat API on http://127.0.0.1:8377/v1, or another: SERVE_ARGS="weights=... port=...".
+# The released tiny base model of version 0.1, which answers prompts, behind OpenAI's chat API on http://127.0.0.1:8377/v1, or another: SERVE_ARGS="weights=... port=...".
 serve: $(STAMP)
 	$(BIN)/python -m proprio_mllm serve $(SERVE_ARGS)
 

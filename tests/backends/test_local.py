@@ -34,7 +34,7 @@ from tests.backends.checkpoints import local_config
 Ask = Callable[..., ChatRequest]
 Look = Callable[..., ChatImage]
 Open = Callable[..., LocalChat]
-TINY = Path(__file__).parents[2] / "weights" / "tiny" / "base"
+TINY = Path(__file__).parents[2] / "weights" / "tiny" / "base-0.1"
 
 
 def told(reply: ChatReply) -> tuple[object, ...]:
@@ -265,7 +265,7 @@ def test_a_closed_chat_answers_nothing(folder: Path, open_chat: Open, ask: Ask) 
 
 
 def test_the_released_base_replies_as_the_project_runs_it(open_chat: Open, view: Look) -> None:
-    """Prompt tokens and reply of `weights/tiny/base` through the project's own collator, positions and decoding."""
+    """Prompt tokens and reply of a model that answers prompts, through the collator, positions and decoding of its planner."""
     model = load_model(TINY)
     collator = Collator(model.processor, model.cfg)
     chat = open_chat(TINY)

@@ -99,7 +99,7 @@ def test_registry() -> None:
     ("weights", "settings", "allowed"),
     [
         ("words", {"max_new_tokens": 20}, "reads whole episodes; allowed: 48"),
-        ("base", {"insist": True}, "reads a prompt of its own at every step; allowed: False"),
+        ("no_mpe", {"insist": True}, "reads a prompt of its own at every step; allowed: False"),
     ],
 )
 def test_settings_that_a_model_would_ignore_are_refused(weights: str, settings: dict[str, Any], allowed: str) -> None:

@@ -17,12 +17,14 @@ from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.mllm import MllmPlanner
 from proprio_mllm.planners.protocol import TaskInfo
 from proprio_mllm.planners.random_planner import RandomPlanner
+from proprio_mllm.planners.registry import make_planner
 from proprio_mllm.planners.words import WordsPlanner
 from sim.tasks.task import load_benchmark, write_tasks
 
 WEIGHTS = Path(__file__).parents[2] / "weights" / "tiny"
 #: Position embedding, cross-spatial encoder, motion tokens.
 PARTS = {
+    "base-0.1": ("mrope", False, False),
     "base": ("mrope", False, False),
     "full": ("rope_sign", True, True),
     "no_mpe": ("mrope", True, True),
@@ -30,7 +32,10 @@ PARTS = {
     "no_mpe_cse": ("mrope", False, True),
     "no_proprio": ("mrope", False, False),
 }
-STAGES = ["base", "dagger", "pointmap", "tokenizer", "alignment", "selu"]
+EPISODES = ["words", "practice", "base", "pointmap", "tokenizer", "alignment"]
+#: What reads whole episodes, and its stages; the others are of version 0.1.
+STAGES = {"base": EPISODES[:3], "full": EPISODES, "base-0.1": ["base"]}
+EARLIER = ["base", "dagger", "pointmap", "tokenizer", "alignment", "selu"]
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +62,10 @@ def test_words_alone_plan(first: Observation) -> None:
 
 @pytest.mark.parametrize("name", PARTS)
 def test_it_plans_with_the_parts_of_its_name(name: str, first: Observation) -> None:
-    planner = MllmPlanner.load(WEIGHTS / name)
+    planner = make_planner(PlannerConfig("m", "mllm", "M", str(WEIGHTS / name)))
+    assert isinstance(planner, MllmPlanner | WordsPlanner)
     cfg = planner.model.cfg
+    assert cfg.episodes == cfg.sees == (name in ("base", "full"))
     assert (cfg.mpe.mode, cfg.cse.enabled, cfg.proprioception) == PARTS[name]
     planner.reset(TaskInfo(first.instruction, first.robot, first.time_limit), np.random.default_rng(0))
     reply = planner.step(first, None)
@@ -73,11 +80,11 @@ def test_it_says_where_it_comes_from(name: str) -> None:
     note = json.loads((WEIGHTS / name / "provenance.json").read_text())
     assert note["seed"] == 0
     assert {"views", "clips"} <= set(note["shards"])
-    assert list(note["stages"]) == (STAGES[:1] if name == "base" else STAGES)
+    assert list(note["stages"]) == STAGES.get(name, EARLIER)
     for stage in note["stages"].values():
         assert stage["command"].startswith("python train.py stage=")
         assert stage["metrics"]["seconds"] > 0
-    assert name == "base" or note["variant"] == name
+    assert name.startswith("base") or note["variant"] == name
 
 
 def test_the_model_plans_alike_alone_and_in_a_batch(tmp_path: Path) -> None:

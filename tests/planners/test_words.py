@@ -282,7 +282,7 @@ def test_refusals_are_counted_until_something_succeeds(planner: WordsPlanner) ->
 def test_a_stored_model_is_known_by_its_configuration(planner: WordsPlanner, tmp_path: Path) -> None:
     save_model(planner.model, tmp_path / "words")
     assert plans_in_words(tmp_path / "words")
-    assert not plans_in_words("weights/tiny/base")
+    assert not plans_in_words("weights/tiny/no_mpe")
     loaded = WordsPlanner.load(tmp_path / "words")
     shown = WordsOnly(3).shown()
     ours, theirs = (one.step_batch([shown], [begin(one)])[0] for one in (planner, loaded))
