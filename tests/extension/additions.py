@@ -233,10 +233,10 @@ class CensusStage:
         Edit(
             "proprio_mllm/training/stages/__init__.py",
             "from proprio_mllm.training.stages.census import CensusStage\n",
-            "from proprio_mllm.training.stages.dagger",
+            "from proprio_mllm.training.stages.pointmap",
         ),
-        Edit("proprio_mllm/training/stages/__init__.py", '    "census": CensusStage(),\n', '    "dagger": '),
-        Edit("configs/schema/train.py", '"census", ', '"dagger", "pointmap", "tokenizer"'),
+        Edit("proprio_mllm/training/stages/__init__.py", '    "census": CensusStage(),\n', '    "pointmap": '),
+        Edit("configs/schema/train.py", '"census", ', '"pointmap", "tokenizer"'),
         Edit(
             "tests/training/test_census.py",
             """from proprio_mllm.training.stages import STAGES

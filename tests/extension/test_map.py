@@ -97,7 +97,7 @@ def test_a_third_robot_needs_no_code(assets: Path, tmp_path: Path) -> None:
         "assert eval.main(['robot=stubby', 'planner=scripted', 'limit=1', 'steps=task', 'workers=1', out]) == 0\n"
         "words = ['model=tiny', 'budget=debug', 'data.robots=[stubby]', 'data.clips=4', out]\n"
         "assert train.main(['stage=data', *words]) == 0\n"
-        "assert train.main(['stage=collect', 'collect.views=8', 'collect.episodes=2', *words]) == 0\n"
+        "assert train.main(['stage=collect', 'collect.views=8', 'collect.lessons=2', *words]) == 0\n"
         "print('works')\n"
     )
     done = ran(code, ROOT, str(tmp_path / "outputs"), DUALTHOR_ASSETS=str(assets))
