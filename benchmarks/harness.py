@@ -152,10 +152,10 @@ def batches(weights: Path, tasks: Sequence[Task]) -> dict[str, float]:
     """Planner calls per second of one core, the first observation of eight tasks."""
     import torch
 
-    from proprio_mllm.planners.mllm import MllmPlanner
+    from proprio_mllm.planners.registry import make_planner
 
     torch.set_num_threads(1)
-    planner = MllmPlanner.load(weights)
+    planner: Any = make_planner(PlannerConfig("model", "mllm", "Model", str(weights)))
     seen = []
     for task in tasks:
         session = open_session(RobotConfig("h1"), "easy", "fixed", task, 0, planner)

@@ -6,7 +6,7 @@ and renamed; the manifest follows each part, so that an interrupted run continue
 refuse unknown versions and name a corrupted file. Files are memory-mapped; nothing is copied into a cache.
 
 Paper: none (engineering). Kinds: `views` (posed views), `clips` (motion with captions and replayed views), `demos` (expert
-steps), `text_planning` and `goal_questions` (the same in words alone), `rollouts` (SELU's trajectories, one row per episode).
+steps), `rollouts` (SELU's trajectories, one row per episode).
 Shape letters: T frames, F motion features, H and W image rows and columns.
 """
 

@@ -10,7 +10,6 @@ Without it they are left out of the log, so that the model sees what its steps h
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,9 +24,9 @@ from proprio_mllm.model.building import load_model, load_motion
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.observing import plan_example
-from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights, parse_reply, succeeded
+from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights, parse_reply, without_failures
 
-__all__ = ["MllmPlanner", "without_failures"]
+__all__ = ["MllmPlanner"]
 
 
 class MllmPlanner:
@@ -118,9 +117,3 @@ class MllmPlanner:
         read = batch.attention_mask.sum(dim=1).tolist()
         each_s = (time.perf_counter() - started) / len(rows)
         return [parse_reply(text, int(count) + len(row), each_s) for text, row, count in zip(texts, rows, read, strict=True)]
-
-
-def without_failures(observation: Observation) -> Observation:
-    """The observation with the failed steps taken out of its log."""
-    kept = tuple(item for item in observation.history if succeeded(item))
-    return dataclasses.replace(observation, history=kept)

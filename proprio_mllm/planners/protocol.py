@@ -9,15 +9,16 @@ Paper: problem formulation (policy over observation, proprioception and feedback
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from data.interface.episode import STEP_LIMIT
 from data.interface.feedback import Feedback
 from data.interface.observation import HistoryItem, Observation
+from data.interface.sightings import Seen
 from data.interface.steps import ActionError, PlanStep
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "check_weights",
     "parse_reply",
     "succeeded",
+    "without_failures",
 ]
 
 
@@ -166,6 +168,15 @@ def check_weights(folder: str | Path, train: str) -> Path:
 def succeeded(item: HistoryItem) -> bool:
     """Whether every action of an earlier step succeeded."""
     return all(part.endswith(" ok") for part in item.feedback.split("; "))
+
+
+_Seen = TypeVar("_Seen", bound=Seen)
+
+
+def without_failures(observation: _Seen) -> _Seen:
+    """What was seen, with the failed steps taken out of its log."""
+    kept = tuple(item for item in observation.history if succeeded(item))
+    return replace(observation, history=kept)  # type: ignore[type-var]  # whatever is seen is a dataclass
 
 
 def parse_reply(text: str, tokens: int = 0, latency_s: float = 0.0) -> PlannerReply:

@@ -24,7 +24,7 @@ from transformers import DynamicCache
 from data.interface.effects import Walk
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
-from data.interface.sightings import Seen, Shown
+from data.interface.sightings import Seen
 from data.interface.steps import PlanStep
 from data.interface.symbolic import events_of
 from proprio_mllm.model.batch import Collator, Example
@@ -36,7 +36,7 @@ from proprio_mllm.model.observing import EpisodeLog, turn_example
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import Words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
-from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights, succeeded
+from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights, without_failures
 
 __all__ = ["WordsPlanner", "WordsState", "plans_in_words"]
 
@@ -188,13 +188,6 @@ class WordsPlanner:
         if state is not None:
             state.cached = len(state.log)
             state.cache.crop(state.cached - state.cache.get_seq_length())  # minus what is no log
-
-
-def without_failures(observation: Seen) -> Seen:
-    """What was seen, with the failed steps taken out of its log."""
-    kept = tuple(item for item in observation.history if succeeded(item))
-    names = observation.visible_objects, observation.known_objects
-    return Shown(observation.instruction, observation.robot, *names, kept)
 
 
 def plans_in_words(folder: str | Path) -> bool:

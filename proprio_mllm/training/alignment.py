@@ -34,7 +34,7 @@ from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, body_state_prompt, described_motion, filled_motion, looking, made_motion
 from proprio_mllm.training.asking import answer_shares
 from proprio_mllm.training.base import EPISODE_ROWS
-from proprio_mllm.training.goal_questions import judge_example
+from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.loop import Parts
 from proprio_mllm.training.phrases import body_state_words
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views, grips_of
@@ -89,8 +89,7 @@ class AlignmentData:
         self._cfg, self._collator = cfg, Collator(model.processor, model.cfg)
         self._style: Style = model.cfg.prompt
         self._proprioception = model.cfg.proprioception
-        self._demo_tokens = demos.tokens(tokenizer) if self._proprioception else None
-        self._grips = None if self._demo_tokens is None else grips_of(demos)
+        self._grips = grips_of(demos)
         with_images = [i for i, images in enumerate(clips.reader.column("image_frames")) if images]
         self._pictured = np.intersect1d(np.asarray(with_images, dtype=np.int64), clips.split.train)
         if self._proprioception and not len(self._pictured):
@@ -121,7 +120,7 @@ class AlignmentData:
 
     def _plan(self, index: int, rng: np.random.Generator) -> Example:
         if rng.random() < self._cfg.judge_share:
-            return judge_example(self.demos, index, rng, self._demo_tokens)
+            return judge_example(self.demos, index, rng, self.turns.codes)
         return self.turns.draw(rng, 1)[0]
 
     def _motion_text(self, kind: Kind, clip: int, codes: Sequence[int], rng: np.random.Generator) -> Example:
@@ -135,8 +134,7 @@ class AlignmentData:
 
     def _feel(self, rng: np.random.Generator, size: int) -> list[Example]:
         """Every grip as often: full hands are rare."""
-        grips, codes = self._grips, self._demo_tokens
-        assert grips is not None
+        grips, codes = self._grips, self.turns.codes
         assert codes is not None
         rows = [int(rng.choice(grips[group])) for group in rng.integers(len(grips), size=size)]
         return [Example(body_state_prompt(codes[i].tolist(), *body_state(self.demos.motions[i]), self._style)) for i in rows]
@@ -162,12 +160,17 @@ def body_state(motion: NDArray[np.floating]) -> tuple[str, str]:
 
 
 @torch.no_grad()
-def body_state_accuracy(model: ProprioMLLM, demos: Demos, tokens: MotionTokenizer, limit: int = 200) -> dict[str, float]:
+def body_state_accuracy(model: ProprioMLLM, demos: Demos, codes: NDArray[np.int64], limit: int = 200) -> dict[str, float]:
     """Share of held-out windows whose open hands and pelvis height the model says rightly, with the commonest answer's share.
 
     The height is asked after the right answer about the hands.
+
+    Args:
+        model: in evaluation mode.
+        demos: the rows.
+        codes: (N, T / stride) their motion tokens.
+        limit: most rows.
     """
-    codes = demos.tokens(tokens)
     rows = [int(i) for i in demos.split.test[:limit]]
     truth = [body_state(demos.motions[i]) for i in rows]
     result: dict[str, float] = {}

@@ -22,7 +22,7 @@ from proprio_mllm.model.dense import DenseHead, DenseTargets, dense_targets
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
 from proprio_mllm.training.asking import answer_shares
-from proprio_mllm.training.goal_questions import judge_example
+from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.loop import Parts
 from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views

@@ -26,8 +26,8 @@ from proprio_mllm.model.observing import EpisodeLog, pictured_turn
 from proprio_mllm.model.prompts import Style, answers, critic_prompt, self_ask_prompt, with_answer
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import answer_words
-from proprio_mllm.training.goal_questions import LOG_LENGTH
 from proprio_mllm.training.goals import Relabel, relabel, verbs_of
+from proprio_mllm.training.judging import LOG_LENGTH
 from proprio_mllm.training.rollouts import Rollout
 
 __all__ = [

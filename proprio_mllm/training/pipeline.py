@@ -154,8 +154,19 @@ class Pipeline:
     ) -> None:
         self.stages, self.cfg, self.command = stages, cfg, command
         self.paths = StagePaths(cfg)
-        self.collect_rollouts, self.collect_dagger, self.lessons = collect_rollouts, collect_dagger, lessons
+        self.collect_rollouts, self.collect_dagger, self._lessons = collect_rollouts, collect_dagger, lessons
         self._taken: Metrics = {}  # steps of each run of the current stage: a time budget may end it early
+
+    @property
+    def lessons(self) -> LessonSource:
+        """Where episodes in words come from.
+
+        Raises:
+            StageError: when none was given.
+        """
+        if self._lessons is None:
+            raise StageError("no source of lessons was given; run the stage with `python train.py`")
+        return self._lessons
 
     def key(self, name: str) -> str:
         """Key of a stage's output under the present configuration and inputs.

@@ -39,6 +39,7 @@ class Turns:
     Attributes:
         train: rows that have an answer and are learnt from.
         test: those that are held out.
+        codes: (N, T / stride) motion tokens of all rows, None without proprioception.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Turns:
         tokens: MotionTokenizer | None = None,
     ) -> None:
         self._model, self._demos = model, demos
-        self._codes = None if tokens is None else demos.tokens(tokens)
+        self.codes = None if tokens is None else demos.tokens(tokens)
         self._told: dict[int, tuple[list[int], list[int], list[int]]] = {}
         names = demos.reader.column("episode")
         starts = [row for row, name in enumerate(names) if row == 0 or name != names[row - 1]]
@@ -72,7 +73,7 @@ class Turns:
     def example(self, row: int) -> Example:
         """The decision of a row."""
         log, now, answer = self._told[row]
-        codes = None if self._codes is None else self._codes[row].tolist()
+        codes = None if self.codes is None else self.codes[row].tolist()
         return pictured_turn(self._model, log, now, self._demos.view(self._demos.reader[row]), codes, answer)
 
 

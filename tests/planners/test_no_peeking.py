@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from configs.schema.eval import PlannerConfig
 from data.interface.feedback import Feedback
 from data.interface.observation import Observation
 from data.interface.steps import PlanStep
@@ -23,9 +24,9 @@ from proprio_mllm.evaluation.sessions import SimSession
 from proprio_mllm.planners.chat.dag_plan.planner import DagPlanner
 from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.chat.plain import PlainPlanner
-from proprio_mllm.planners.mllm import MllmPlanner
 from proprio_mllm.planners.protocol import Planner
 from proprio_mllm.planners.random_planner import RandomPlanner
+from proprio_mllm.planners.registry import make_planner
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 from sim.session.session import Session
 from sim.tasks.predicates import Predicate
@@ -140,7 +141,7 @@ def planners() -> dict[str, Callable[[list[Script]], Planner]]:
     return {
         "random": lambda scripts: RandomPlanner(112),
         "scripted": lambda scripts: ScriptedPlanner(112),
-        "mllm": lambda scripts: MllmPlanner.load(WEIGHTS),
+        "mllm": lambda scripts: make_planner(PlannerConfig("m", "mllm", "M", str(WEIGHTS))),
         "plain": chat(PlainPlanner, body=True),
         "dag_plan": chat(DagPlanner, graph_of),
     }

@@ -19,8 +19,8 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.word_tokens import add_word_tokens, known_words
 from proprio_mllm.model.wording import id_words, read_step
 from proprio_mllm.training.critic import Judge, Kept, Trajectory, actor_examples, audit, critic_examples, keep
-from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.goals import Relabel
+from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.pipeline import base_model_config
 from proprio_mllm.training.rollouts import Moment, Rollout
 from proprio_mllm.training.sources import Demos

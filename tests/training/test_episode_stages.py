@@ -8,12 +8,8 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
-from configs.compose import compose
-from configs.schema.train import TrainConfig
-from configs.validate import build
 from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.building import build_model, build_processor, load_model, save_model
 from proprio_mllm.model.groups import train_only
@@ -25,23 +21,7 @@ from proprio_mllm.training.pipeline import Pipeline, base_model_config
 from proprio_mllm.training.rollouts import read_rollouts
 from proprio_mllm.training.stages import STAGES
 from proprio_mllm.training.stages.inputs import episodes_in_words, lesson_folders, lessons_of, turns_of
-from tests.training.test_pipeline import _small, collect, correct
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
-    """Every stage, run once."""
-    torch.set_num_threads(1)
-    root = tmp_path_factory.mktemp("episodes")
-    overrides = ["budget=debug", f"output={root}", "logger.wandb=disabled", "selu.truth=oracle"]
-    cfg = build(TrainConfig, compose("train", overrides))
-    small = dataclasses.replace(cfg, model=_small(cfg.model))
-    (root / "tiny").mkdir()
-    shutil.copytree(shards, root / "tiny" / "data")
-    pipeline = Pipeline(STAGES, small, collect, "python train.py stage=all", correct, Lessons())
-    for stage in pipeline.stages:
-        assert pipeline.run(stage) is not None
-    return pipeline
+from tests.training.conftest import collect
 
 
 def test_every_stage_reads_the_one_before(trained: Pipeline) -> None:

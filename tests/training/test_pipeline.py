@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from configs.compose import compose
-from configs.schema.model import ModelConfig
 from configs.schema.train import TrainConfig
 from configs.validate import ConfigError, build
-from data.interface.observation import Camera, Observation, Proprioception
 from data.shards import ShardError, ShardReader, ShardWriter
 from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.building import add_adapter, load_model
@@ -25,88 +21,13 @@ from proprio_mllm.model.groups import train_only
 from proprio_mllm.training import release
 from proprio_mllm.training.alignment import PHASES, AlignmentObjective
 from proprio_mllm.training.pipeline import Pipeline, StageError, variant_model
-from proprio_mllm.training.rollouts import DaggerRequest, RolloutRequest, read_rollouts, rollout_row
+from proprio_mllm.training.rollouts import RolloutRequest, read_rollouts, rollout_row
 from proprio_mllm.training.sources import Demos, shard_hash
 from proprio_mllm.training.stages import STAGES
 from proprio_mllm.training.stages.alignment import start
 from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
 from proprio_mllm.training.stages.selu import CRITIC, copy_adapter, train_adapter
-
-HELPERS = importlib.util.spec_from_file_location("training_helpers", Path(__file__).with_name("conftest.py"))
-assert HELPERS is not None
-assert HELPERS.loader is not None
-helpers = importlib.util.module_from_spec(HELPERS)
-HELPERS.loader.exec_module(helpers)
-POSE, K, motion_window, scene = helpers.POSE, helpers.K, helpers.motion_window, helpers.scene
-
-STEPS = (
-    ("GoTo(Mug_1)", "GoTo(Mug_1) ok", True),
-    ("Pick(left, Mug_1)", "Pick(left, Mug_1) ok", True),
-    ("Place(left, CoffeeTable_1)", "Place(left, CoffeeTable_1) ok", True),
-)
-
-
-def collect(request: RolloutRequest) -> None:
-    """Scripted episodes in place of the simulator: two tasks, of which the second is not what the robot did."""
-    rng = np.random.default_rng(request.seed)
-    ids = ("Mug_1", "Plate_1", "CoffeeTable_1")
-    rows = []
-    for number, text in enumerate(("Put the mug on the coffee table.", "Put the plate on the coffee table.")):
-        observations = []
-        steps = STEPS if number == 0 else (("MoveAhead(0.5)", "MoveAhead(0.5) ok", True), *STEPS)
-        for step in range(len(steps) + 1):
-            motion = motion_window(rng)
-            proprioception = Proprioception(motion, 20.0, np.zeros(3), motion[-1, :42].reshape(14, 3).astype(np.float64))
-            camera = Camera(K, POSE, 112, 112)
-            image = scene(rng)[0]
-            observations.append(Observation(text, "h1", image, camera, ids[:2], ids, proprioception, (), step, 8))
-        truth = {"on CoffeeTable_1": ["Mug_1"], "held": []}
-        keys = (f"e{number}", "t", "single", "kitchen_1", 1, "natural")
-        rows.append(rollout_row(*keys, observations, steps, number == 0, truth))
-    writer = ShardWriter(request.folder, "rollouts", request.config_hash, overwrite=True)
-    writer.write(0, rows)
-    writer.finish({})
-
-
-def correct(request: DaggerRequest, workers: int) -> None:
-    """Scripted corrections in place of the simulator: a student that is right on every second of its steps."""
-    assert workers > 0
-    source = ShardReader(request.folder.parent / "lessons", "demos")
-    rows = []
-    for number in range(12):
-        row = dict(source[number])
-        executed = row["target"] if number % 2 else "MoveAhead(0.5)"
-        note = {"executed": executed, "origin": "student" if number < 8 else "teacher"}
-        rows.append({**row, "episode": f"corrected{number // 4}", "privileged": json.dumps(note)})
-    writer = ShardWriter(request.folder, "demos", request.config_hash, overwrite=True)
-    writer.write(0, rows)
-    writer.finish({})
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
-    """Every stage, run once."""
-    torch.set_num_threads(1)
-    root = tmp_path_factory.mktemp("run")
-    cfg = build(TrainConfig, compose("train", ["budget=debug", f"output={root}", "logger.wandb=disabled", "selu.truth=oracle"]))
-    small = dataclasses.replace(cfg, model=_small(cfg.model))
-    (root / "tiny").mkdir()
-    shutil.copytree(shards, root / "tiny" / "data")
-    pipeline = Pipeline(STAGES, small, collect, "python train.py stage=all", correct, Lessons())
-    for stage in STAGES:
-        assert pipeline.run(stage) is not None
-    return pipeline
-
-
-def _small(model: ModelConfig) -> ModelConfig:
-    return dataclasses.replace(
-        model,
-        vocab_size=450,
-        text=dataclasses.replace(model.text, hidden=64, layers=2, heads=2, kv_heads=1, intermediate=96),
-        vision=dataclasses.replace(model.vision, hidden=32, depth=2, heads=2, intermediate=48),
-        point_map=dataclasses.replace(model.point_map, width=32, depth=1),
-        motion=dataclasses.replace(model.motion, codes=32, code_dim=16, width=16, depth=1),
-    )
+from tests.training.conftest import STEPS, collect, correct
 
 
 def test_current_stages_are_skipped_and_others_are_not(trained: Pipeline) -> None:

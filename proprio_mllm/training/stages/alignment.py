@@ -57,8 +57,8 @@ class AlignmentStage:
             )
         save_model(model.eval(), pipeline.paths.model("alignment"), read)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
-        felt = body_state_accuracy(model, demos, read) if read is not None else {}
-        told = {} if pipeline.lessons is None else held_out_metrics(model, {"": pipeline.lessons.episode})
+        felt = {} if turns.codes is None else body_state_accuracy(model, demos, turns.codes)
+        told = held_out_metrics(model, {"": pipeline.lessons.episode})
         return {**asked, **felt, **turn_accuracy(model, turns), **told}
 
 

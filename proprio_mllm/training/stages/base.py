@@ -13,7 +13,7 @@ from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.word_tokens import add_word_tokens
 from proprio_mllm.model.wording import id_words
 from proprio_mllm.training.base import DenseObjective, JointObjective, grounding_accuracy
-from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError, base_model_config, seeded
+from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config, seeded
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
 from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
 from proprio_mllm.training.text import adopt, corpus, start_from_words, whole_words
@@ -39,11 +39,9 @@ class BaseStage:
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
         """Trains and stores the base model; nothing to do where pretrained weights are given."""
-        cfg, lessons = pipeline.cfg, pipeline.lessons
         if pipeline.needs_no(self.name):
             return {}
-        if lessons is None:
-            raise StageError("stage 'base' needs lessons: run it with `python train.py stage=base`")
+        cfg, lessons = pipeline.cfg, pipeline.lessons
         plain = dataclasses.replace(base_model_config(cfg.model), episodes=True, sees=True)
         views, clips = Views(pipeline.paths.shards("views"), plain), Clips(pipeline.paths.shards("clips"))
         demos = lessons_of(pipeline, plain)

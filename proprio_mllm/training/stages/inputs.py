@@ -7,7 +7,7 @@ from pathlib import Path
 from configs.schema.model import ModelConfig
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.training.pipeline import Pipeline, StageError
+from proprio_mllm.training.pipeline import Pipeline
 from proprio_mllm.training.sources import Demos
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordsObjective, mixed
@@ -28,24 +28,12 @@ def lessons_of(pipeline: Pipeline, model: ModelConfig) -> Demos:
 
 
 def episodes_in_words(pipeline: Pipeline, model: ProprioMLLM, key: str) -> WordsObjective:
-    """Episodes of the text world and of the simulator, in the shares of stage `practice`.
-
-    Raises:
-        StageError: without a source of lessons.
-    """
+    """Episodes of the text world and of the simulator, in the shares of stage `practice`."""
     lessons, cfg = pipeline.lessons, pipeline.cfg.practice
-    if lessons is None:
-        raise StageError("no source of lessons was given; run the stage with `python train.py`")
     shares = zip((cfg.logged, cfg.own_share), map(lessons.logged, lesson_folders(pipeline)), strict=False)
     return WordsObjective(model, mixed(lessons.episode, *shares), key)
 
 
 def turns_of(pipeline: Pipeline, model: ProprioMLLM, demos: Demos, tokens: MotionTokenizer | None = None) -> Turns:
-    """Decisions with pictures of the rows of `lessons_of`.
-
-    Raises:
-        StageError: without a source of lessons.
-    """
-    if pipeline.lessons is None:
-        raise StageError("no source of lessons was given; run the stage with `python train.py`")
+    """Decisions with pictures of the rows of `lessons_of`."""
     return Turns(model, demos, lesson_folders(pipeline), pipeline.lessons.told, tokens)

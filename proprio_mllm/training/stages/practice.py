@@ -40,8 +40,8 @@ class PracticeStage:
         if pipeline.needs_no(self.name):
             return {}
         lessons, cfg, student = pipeline.lessons, pipeline.cfg.practice, pipeline.paths.model("words")
-        if lessons is None or pipeline.collect_dagger is None:
-            raise StageError("stage 'practice' needs lessons and the simulator: run it with `python train.py stage=practice`")
+        if pipeline.collect_dagger is None:
+            raise StageError("stage 'practice' needs the simulator: run it with `python train.py stage=practice`")
         shards = pipeline.paths.shards("practice")
         if pipeline.cfg.overwrite:
             shutil.rmtree(shards, ignore_errors=True)

@@ -39,8 +39,8 @@ from proprio_mllm.training.critic import (
     critic_examples,
     keep,
 )
-from proprio_mllm.training.goal_questions import judge_example
 from proprio_mllm.training.goals import Relabel
+from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.pipeline import Metrics, Pipeline
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
@@ -149,10 +149,9 @@ class _Selu:
         self.collator = Collator(self.model.processor, self.model.cfg)
         self.demos = lessons_of(self.pipeline, self.model.cfg)
         self.turns = turns_of(self.pipeline, self.model, self.demos, self.tokenizer)
-        self._tokens = None if self.tokenizer is None else self.demos.tokens(self.tokenizer)
 
     def _judging(self, rng: np.random.Generator) -> Example:
-        return judge_example(self.demos, int(self.demos.draw(rng, 1)[0]), rng, self._tokens)
+        return judge_example(self.demos, int(self.demos.draw(rng, 1)[0]), rng, self.turns.codes)
 
     def _planning(self, rng: np.random.Generator) -> Example:
         return self.turns.draw(rng, 1)[0]

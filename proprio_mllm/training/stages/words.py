@@ -10,7 +10,7 @@ from typing import Any
 from configs.schema.model import ModelConfig
 from proprio_mllm.model.building import build_model, build_processor, save_model
 from proprio_mllm.model.word_tokens import add_word_tokens
-from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError, base_model_config
+from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config
 from proprio_mllm.training.words import WordsObjective, held_out_metrics, mixed
 
 __all__ = ["WordsStage"]
@@ -36,8 +36,6 @@ class WordsStage:
         if pipeline.needs_no(self.name):
             return {}
         lessons, share = pipeline.lessons, pipeline.cfg.words.logged
-        if lessons is None:
-            raise StageError("stage 'words' needs a source of lessons: run it with `python train.py stage=words`")
         cfg = _plain(pipeline.cfg.model)
         words = lessons.words()
         processor = build_processor(cfg, [" ".join(words)] * 2)
