@@ -13,7 +13,7 @@ from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.branches import read_branches
 from proprio_mllm.model.building import build_model, build_processor
 from proprio_mllm.model.modeling import ProprioMLLM
-from proprio_mllm.model.word_tokens import WordTokens, add_word_tokens
+from proprio_mllm.model.word_tokens import EnglishTokens, WordTokens, add_word_tokens, tokens_of
 from proprio_mllm.training.pipeline import base_model_config
 from proprio_mllm.training.words import WordsObjective, collate, rows_of
 
@@ -71,8 +71,11 @@ def test_every_learnt_decision_is_in_one_row(model: ProprioMLLM) -> None:
     assert len(branches) > 2
 
 
-def test_few_decisions_are_too_long_to_be_learnt(model: ProprioMLLM) -> None:
-    words, episodes = WordTokens(model.processor.tokenizer), [Lessons().episode(seed) for seed in range(60)]
+@pytest.mark.parametrize("spelt", [False, True], ids=["words", "spelt"])
+def test_few_decisions_are_too_long_to_be_learnt(model: ProprioMLLM, spelt: bool) -> None:
+    tokenizer = build_processor(model.cfg, [" ".join(Lessons().words())] * 2).tokenizer if spelt else model.processor.tokenizer
+    words, episodes = tokens_of(tokenizer), [Lessons().episode(seed) for seed in range(60)]
+    assert isinstance(words, EnglishTokens if spelt else WordTokens)
     learnt = sum(len(row.branches) for one in episodes for row in rows_of(one, words))
     assert learnt > 0.95 * sum(len(one.turns) for one in episodes)
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from configs.schema.model import ModelConfig
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Views
+from data.motion import HAND_OPENING, OPEN_HAND
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Demos, Views, grips_of
 
 
 @pytest.mark.parametrize(
@@ -20,3 +21,15 @@ def test_views_ask_in_the_models_style(shards: Path, cfg: ModelConfig, style: st
     text = "\n".join([*asked, views.listing(row)[0]])
     for part in wanted:
         assert part in text
+
+
+def test_grips_are_rows_of_one_robot_with_the_same_hands_open(shards: Path, cfg: ModelConfig) -> None:
+    demos = Demos(shards / "lessons", cfg)
+    rng = np.random.default_rng(0)
+    demos.motions[:, -1, HAND_OPENING] = rng.choice((0.2, 1.0), (len(demos.motions), 2))
+    grips, robots = grips_of(demos), demos.reader.column("robot")
+    assert len(grips) == 4
+    assert sorted(row for rows in grips for row in rows) == demos.split.train.tolist()
+    for rows in grips:
+        opened = demos.motions[rows, -1, HAND_OPENING] >= OPEN_HAND
+        assert len({(robots[row], *hands) for row, hands in zip(rows, opened.tolist(), strict=True)}) == 1
