@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import logging
 import os
 import sys
@@ -65,8 +67,14 @@ def run(cfg: EvalConfig) -> int:
             table.show()
         return 0
     try:
-        with logging_redirect_tqdm():  # retries and warnings above the progress bar, not across it
-            done = evaluate(cfg)
+        with logging_redirect_tqdm(), contextlib.ExitStack() as closing:  # warnings above the progress bar, not across it
+            opener = None
+            if cfg.watch:
+                from proprio_mllm.evaluation.watching import Watching
+
+                cfg = dataclasses.replace(cfg, workers=0, batch=1, threads=1, scheduler="local", ray_address=None)
+                opener = closing.enter_context(contextlib.closing(Watching()))
+            done = evaluate(cfg, opener)
         folder = done.folder
         run = load_run(folder)
         table = write_report(run)

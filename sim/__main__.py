@@ -17,6 +17,7 @@ COMMANDS: Final = {
     "motion": ("sim.tools.motion", "film of a human clip beside the robots that it was retargeted to"),
     "collect": ("sim.collection.collect", "shards to train on: views, demonstrations, planning in words"),
     "benchmark": ("sim.benchmark.commands", "the 359 tasks and their certificates: check, refresh, tabulate, or generate them"),
+    "play": ("sim.play.server", "a room to play in, in the browser"),
     "serve": ("sim.interfaces.remote.serve", "the Controller over HTTP"),
 }
 

@@ -168,6 +168,7 @@ class EvalConfig:
         output: folder of all outputs.
         experiment: assemble this instead of running episodes.
         sanity: run two tasks on each robot with the expert, the rules and the tiny model, and keep nothing.
+        watch: show the episodes in the browser, one after the other, in this process (`sim.play.live`).
         reflection: whether failures are reflected on; planners that can take it from here (`planner.reflection`).
         backend: the language model that planners which chat ask, and a planner of a file that takes one; others have none.
         threads: episodes that go on at a time in one process (`workers=0`), each with a planner of its own whose calls wait
@@ -196,6 +197,7 @@ class EvalConfig:
     output: str = "outputs"
     experiment: ExperimentConfig | None = None
     sanity: bool = False
+    watch: bool = False
     reflection: Literal["on", "off"] = "on"
     backend: BackendConfig | None = None
     threads: int = 1

@@ -39,7 +39,16 @@ from sim.tasks.task import Task
 if TYPE_CHECKING:
     from proprio_mllm.evaluation.recording import RolloutRecorder
 
-__all__ = ["EpisodeJob", "EpisodeResult", "EpisodeWorker", "Opener", "PlannerServer", "WorkerSetup", "lost_episode"]
+__all__ = [
+    "EpisodeJob",
+    "EpisodeResult",
+    "EpisodeWorker",
+    "Opener",
+    "PlannerServer",
+    "WorkerSetup",
+    "lost_episode",
+    "open_simulator",
+]
 
 #: Calls in a row that do not reach a server which has answered before, each with its repetitions, until the run stops.
 _MOST_UNREACHED: Final = 5
@@ -121,7 +130,8 @@ class EpisodeResult:
 Opener = Callable[[WorkerSetup, EpisodeJob, Planner], RunnableSession]
 
 
-def _open(setup: WorkerSetup, job: EpisodeJob, planner: Planner) -> RunnableSession:
+def open_simulator(setup: WorkerSetup, job: EpisodeJob, planner: Planner) -> RunnableSession:
+    """A session of the simulator: the `Opener` of runs."""
     from proprio_mllm.evaluation.sessions import open_session  # physics and rendering load only where they run
 
     return open_session(
@@ -144,7 +154,7 @@ class EpisodeWorker:
         opener: opens sessions; the simulator's by default.
     """
 
-    def __init__(self, setup: WorkerSetup, opener: Opener = _open) -> None:
+    def __init__(self, setup: WorkerSetup, opener: Opener = open_simulator) -> None:
         logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
         self.setup = setup
         self._opener = opener

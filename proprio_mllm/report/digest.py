@@ -15,7 +15,7 @@ from data.interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, Deciding, deciding_failure, unmet_objects
 from proprio_mllm.report.frames import ActedOut, episode_id
 from proprio_mllm.report.runs import Run
-from proprio_mllm.report.words import code_in_words, goal_in_words, margins_in_words
+from proprio_mllm.report.words import code_in_words, margins_in_words
 from sim.tasks.task import Task
 
 __all__ = ["episode_digest", "run_digest"]
@@ -115,7 +115,7 @@ def _goals(task: Task | None, acted: ActedOut | None) -> list[dict[str, Any]]:
     found = []
     for number, goal in enumerate(task.goals):
         held = None if acted is None else [row[number] for row in acted.goals]
-        found.append({"text": goal_in_words(goal.to_json()), "goal": goal.to_json(), "held": held, "since": _since(held)})
+        found.append({"text": goal.to_text(), "goal": goal.to_json(), "held": held, "since": _since(held)})
     return found
 
 

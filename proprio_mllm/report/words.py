@@ -1,34 +1,16 @@
-"""Goals, failure codes and margins in words, for people who read an episode.
+"""Failure codes and margins in words, for people who read an episode.
 
-Margins are signed and named as `data.interface.failures` says; goals are printed from their plain form, so that a new kind of
-predicate needs nothing here.
+Margins are signed and named as `data.interface.failures` says.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Final
 
 from data.interface.failures import FAILURES, FailureCode
 
-__all__ = ["code_in_words", "goal_in_words", "margins_in_words"]
-
-
-def goal_in_words(goal: Mapping[str, Any]) -> str:
-    """A goal's plain form as text: `on(Mug_1, Table_1)`, `and(open(Fridge_1), held(Mug_1))`, `count(…, at_least=2)`."""
-    parts: list[str] = []
-    for name, value in goal.items():
-        if name == "kind":
-            continue
-        if isinstance(value, list | tuple):
-            parts.extend(goal_in_words(one) if isinstance(one, Mapping) else str(one) for one in value)
-        elif isinstance(value, Mapping):
-            parts.append(goal_in_words(value))
-        elif isinstance(value, str):
-            parts.append(value)
-        else:
-            parts.append(f"{name}={value}")
-    return f"{goal['kind']}({', '.join(parts)})"
+__all__ = ["code_in_words", "margins_in_words"]
 
 
 def code_in_words(code: str) -> str:

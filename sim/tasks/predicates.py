@@ -166,6 +166,17 @@ class Predicate:
         name, value = _STATES[self.kind]
         return bool(entry[name]) == value
 
+    def to_text(self) -> str:
+        """For people: `on(Mug_1, Table_1)`, `and(open(Fridge_1), held(Mug_1))`, `count(…, at_least=2)`."""
+        parts: list[str] = []
+        for name in KINDS[self.kind]:
+            value = getattr(self, name)
+            if name == "of":
+                parts += [operand.to_text() for operand in value]
+            else:
+                parts.append(f"at_least={value}" if name == "at_least" else value)
+        return f"{self.kind}({', '.join(parts)})"
+
     def to_json(self) -> dict[str, Any]:
         """Plain form with only the arguments that the kind takes, in a fixed order."""
         record: dict[str, Any] = {"kind": self.kind}

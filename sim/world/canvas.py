@@ -1,4 +1,4 @@
-"""One OpenGL context with MuJoCo's meshes in it, shared by all worlds of the same robot, room and image size.
+"""One OpenGL context with MuJoCo's meshes in it, shared by all worlds of a thread with the same robot, room and image size.
 
 Making a context costs 0.2 s, drawing 8 ms, so contexts live as long as the process and are handed from world to world. Two
 passes give everything: colours from one, segment numbers and depth together from the other.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import threading
 
 import mujoco
 import numpy as np
@@ -104,10 +105,11 @@ class _Key:
 
 
 @functools.lru_cache(maxsize=24)
-def _canvas(key: _Key, height: int, width: int, samples: int) -> Canvas:
+def _canvas(key: _Key, height: int, width: int, samples: int, thread: int) -> Canvas:
+    del thread  # an OpenGL context is current in one thread only
     return Canvas(key.model, height, width, samples)
 
 
 def shared_canvas(model: mujoco.MjModel, name: str, height: int, width: int, samples: int = 0) -> Canvas:
-    """The process's canvas for a robot and room (`name` stands for their meshes and textures) at a size."""
-    return _canvas(_Key(model, name), height, width, samples)
+    """The thread's canvas for a robot and room (`name` stands for their meshes and textures) at a size."""
+    return _canvas(_Key(model, name), height, width, samples, threading.get_ident())

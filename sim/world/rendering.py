@@ -32,6 +32,7 @@ __all__ = [
     "View",
     "camera_intrinsics",
     "camera_pose",
+    "greys",
 ]
 
 CAMERAS: Final = ("head", "front", "left", "right", "behind", "top", "overview", "plan")
@@ -125,7 +126,7 @@ def _camera_id(scene: SceneState, camera: str) -> int:
     return index
 
 
-def _greys(scene: SceneState) -> dict[int, float]:
+def greys(scene: SceneState) -> dict[int, float]:
     """Greys for the meshes of a robot that is black all over, by geom: large shells are light, what joins them is dark."""
     model, mesh = scene.model, int(mujoco.mjtGeom.mjGEOM_MESH)
     found: dict[int, float] = {}
@@ -165,7 +166,7 @@ class Renderer:
         self._camera.type = int(mujoco.mjtCamera.mjCAMERA_FIXED)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._drawn.flags[int(flag)] = int(pretty)
-        self._shades = _greys(scene) if pretty else {}
+        self._shades = greys(scene) if pretty else {}
         self._planes = np.flatnonzero(scene.model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))
         robot = np.isin(scene.model.geom_bodyid, list(scene.robot_bodies))
         labels = np.where(robot, _ROBOT, scene.object_of_geom).astype(np.int32)

@@ -20,7 +20,7 @@ from proprio_mllm.report.html import main, page, run_data
 from proprio_mllm.report.reenact import RunTasks
 from proprio_mllm.report.runs import load_run
 from sim.tasks.task import write_tasks
-from tests.report.browser import Browser, chromium
+from tests.browser import Browser, chromium
 from tests.report.ledgers import HOSTILE, LAMP, failed, fine, record_of, step, write_run
 
 HEIGHT = failed("Pick(left, Mug_1)", "BodyTooHigh", "body_adjustment", height_m=-0.12, reach_m=0.05)

@@ -1,28 +1,11 @@
-"""Goals, codes and margins in words."""
+"""Codes and margins in words."""
 
 from __future__ import annotations
 
 import pytest
 
 from data.interface.failures import FAILURES, FailureCode
-from proprio_mllm.report.words import code_in_words, goal_in_words, margins_in_words
-from sim.tasks.predicates import Predicate
-from sim.tasks.task import load_benchmark
-
-
-def test_goals_are_printed_from_their_plain_form() -> None:
-    both = Predicate("and", of=(Predicate("open", "Fridge_1"), Predicate("on", "Mug_1", "Table_1")))
-    assert goal_in_words(both.to_json()) == "and(open(Fridge_1), on(Mug_1, Table_1))"
-    count = Predicate("count", of=(both, Predicate("not", of=(Predicate("held", "Cup_1"),))), at_least=1)
-    assert goal_in_words(count.to_json()) == f"count({goal_in_words(both.to_json())}, not(held(Cup_1)), at_least=1)"
-    unheard_of = {"kind": "filled", "object_id": "Cup_1", "with": {"kind": "liquid", "litres": 0.2}, "hot": True}
-    assert goal_in_words(unheard_of) == "filled(Cup_1, liquid(litres=0.2), hot=True)"
-
-
-def test_every_goal_of_the_benchmark_has_words() -> None:
-    for task in load_benchmark():
-        for goal in task.goals:
-            assert all(name in goal_in_words(goal.to_json()) for name in goal.object_ids())
+from proprio_mllm.report.words import code_in_words, margins_in_words
 
 
 @pytest.mark.parametrize("code", FailureCode)

@@ -3,6 +3,7 @@
 import pytest
 
 from sim.tasks.predicates import ANY, Predicate, PredicateError, goal_fraction, goals_hold
+from sim.tasks.task import load_benchmark
 
 
 def entry(object_id, on=(), held=(), **state):
@@ -117,3 +118,11 @@ def test_an_exists_names_its_receptacle_and_involves_every_object_of_its_type():
     assert set(goal.involved(["Mug_10", "Mug_2", "Table_1", "Mugger_1"])) == {"Table_1", "Mug_2", "Mug_10"}
     assert [operand.object_id for operand in goal.candidates(["Mug_10", "Mug_2"])] == ["Mug_2", "Mug_10"]
     assert goal.to_json() == {"kind": "exists", "object_type": "Mug", "of": [ON_TABLE.to_json()], "at_least": 1}
+
+
+def test_goals_in_text() -> None:
+    both = Predicate("and", of=(Predicate("open", "Fridge_1"), ON_TABLE))
+    assert both.to_text() == f"and(open(Fridge_1), {ON_TABLE.to_text()})"
+    count = Predicate("count", of=(both, Predicate("not", of=(Predicate("held", "Cup_1"),))), at_least=1)
+    assert count.to_text() == f"count({both.to_text()}, not(held(Cup_1)), at_least=1)"
+    assert all(name in goal.to_text() for task in load_benchmark() for goal in task.goals for name in goal.object_ids())

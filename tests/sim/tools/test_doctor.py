@@ -52,14 +52,16 @@ def test_other_and_missing_versions_are_named(tmp_path: Path, monkeypatch: pytes
     assert not doctor._packages().remedy
     lock, project = tmp_path / "requirements.lock", tmp_path / "pyproject.toml"
     project.write_text(
-        '[project]\ndependencies = ["numpy>=2"]\noptional-dependencies = {train = ["no-such-thing"], llm = []}\n'
+        '[project]\ndependencies = ["numpy>=2"]\noptional-dependencies = {train = ["no-such-thing"], llm = [], play = []}\n'
     )
     lock.write_text("numpy==0.1\n")
     assert "numpy" in doctor._packages().found
     assert not doctor._packages().fatal
     lock.write_text(f"numpy=={np.__version__}\nno-such-thing==1.0\n")
     assert doctor._packages() == Finding("1 as pinned, without the extras train")
-    project.write_text('[project]\ndependencies = ["no-such-thing>1"]\noptional-dependencies = {train = [], llm = []}\n')
+    project.write_text(
+        '[project]\ndependencies = ["no-such-thing>1"]\noptional-dependencies = {train = [], llm = [], play = []}\n'
+    )
     assert doctor._packages() == Finding("missing: no-such-thing", "run `make setup`", True)
     assert "train.py" in doctor._weights().remedy
 

@@ -96,14 +96,15 @@ class Browser:
             self.messages.append(event["params"]["entry"]["text"])
         return event
 
-    def open(self, path: Path, hash_: str = "") -> float:
-        """Opens a file anew; returns the seconds until the load event."""
+    def open(self, page: Path | str, hash_: str = "") -> float:
+        """Opens a file or an address anew; returns the seconds until the load event."""
+        address = page if isinstance(page, str) else page.resolve().as_uri()
         self.call("Page.navigate", {"url": "about:blank"})
         self.requests.clear()
         self.messages.clear()
         started = time.perf_counter()
-        self.call("Page.navigate", {"url": f"{path.resolve().as_uri()}{hash_}"})
-        while self.eval("location.href.startsWith('file:') && document.readyState") != "complete":
+        self.call("Page.navigate", {"url": f"{address}{hash_}"})
+        while self.eval("location.href != 'about:blank' && document.readyState") != "complete":
             time.sleep(0.01)
         return time.perf_counter() - started
 
