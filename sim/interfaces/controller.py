@@ -180,13 +180,14 @@ class Controller(Stopped):
         contingency: name of the outcome distributions (`configs/contingency`, or one's own assets).
         all_known: whether actions may name any object, seen or not.
         undo_limit: how many steps Undo goes back; each takes about a megabyte.
+        field_of_view: of the head camera, vertical, degrees; the robot's own when it is None.
 
     Attributes:
         session: what is driven.
         last_event: the latest event.
 
     Raises:
-        ValueError: on a frame without pixels, or larger than 1280.
+        ValueError: on a frame without pixels, or larger than 1280, or a field of view outside 1..170.
     """
 
     def __init__(
@@ -203,10 +204,14 @@ class Controller(Stopped):
         undo_limit: int = 100,
         contingency: str = "default",
         all_known: bool = False,
+        field_of_view: float | None = None,
     ) -> None:
         for side, value in (("width", width), ("height", height)):
             if not 1 <= value <= MAX_SIZE:
                 raise ValueError(f"{side} {value} outside 1..{MAX_SIZE}")
+        if field_of_view is not None and not 1.0 <= field_of_view <= 170.0:
+            raise ValueError(f"field_of_view {field_of_view:g} outside 1..170")
+        self._fov = field_of_view
         self.session = Session(robot_type, difficulty, min(width, height), contingency, all_known=all_known)
         self._shape, self._seed = (height, width), seed
         self._cameras, self._privileged = tuple(third_party_cameras), privileged
@@ -232,6 +237,8 @@ class Controller(Stopped):
 
     def _restart(self, task: TaskLike) -> None:
         self.session.reset(task, self._seed)
+        if self._fov is not None:
+            self.session.world.model.camera(self.session.robot.head_camera).fovy = self._fov
         self._undo.clear()
         self._redo.clear()
         self._saved = {}

@@ -142,7 +142,8 @@ class Controller(own.Stopped):
         autoApproach: whether an action walks up to what is out of reach, and changes the pelvis height.
         difficulty: easy, medium, hard or natural.
         seed: key of the luck.
-        options: those of `UNUSED`, which have no use here; `fieldOfView` is refused unless it is the camera's own.
+        fieldOfView: of the head camera, vertical, degrees; the robot's own when it is None.
+        options: those of `UNUSED`, which have no use here.
 
     Attributes:
         last_event: the latest event.
@@ -162,20 +163,20 @@ class Controller(own.Stopped):
         autoApproach: bool = True,
         difficulty: str = "easy",
         seed: int = 0,
+        fieldOfView: float | None = None,
         **options: Any,
     ) -> None:
-        unknown = sorted(set(options) - set(UNUSED) - {"fieldOfView"})
+        unknown = sorted(set(options) - set(UNUSED))
         if unknown:
-            raise ValueError(f"unknown option {unknown[0]!r}; allowed: {', '.join((*UNUSED, 'fieldOfView'))}")
+            raise ValueError(f"unknown option {unknown[0]!r}; allowed: {', '.join(UNUSED)}")
+        fov = None if fieldOfView is None else number("Controller", "fieldOfView", fieldOfView)
         self._grid_m, self._turn_deg = number("Controller", "gridSize", gridSize), float(rotateStepDegrees)
         self._approach = autoApproach
         self._cameras: list[tuple[Array, float]] = []
         self._own = own.Controller(
-            robot_type, _room(scene), width, height, difficulty=difficulty, seed=seed, privileged=True, all_known=True
-        )
-        seen = float(self._own.last_event.metadata["fov"])
-        if abs(number("Controller", "fieldOfView", options.get("fieldOfView", seen)) - seen) > 0.5:
-            raise ValueError(f"fieldOfView {options['fieldOfView']} is not that of the head camera, {seen:g}")
+            robot_type, _room(scene), width, height, difficulty=difficulty, seed=seed, privileged=True, all_known=True,
+            field_of_view=fov,
+        )  # fmt: skip
         self._shape = (height, width)
         self.last_event = self._turned(self._own.last_event)
 
@@ -237,6 +238,7 @@ class Controller(own.Stopped):
             "Reset": lambda call: self.reset(**call) and self._own.last_event,
             "Teleport": self._teleport,
             "TeleportFull": self._teleport,
+            "Rotate": lambda call: self._teleport({"rotation": call.pop("rotation", 0.0), **call}),  # to a heading
             "Done": lambda _: self._own.step("Pass"),  # the plan grammar's ends the episode
             "Crouch": lambda _: self._to_height(self.session.robot.pelvis_height_range_m[0]),
             "Stand": lambda _: self._to_height(self.session.robot.standing_pelvis_height_m),

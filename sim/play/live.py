@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sim.play.viewer import HOST, STATE, serve
 from sim.session.session import Session
 from sim.skills.runner import CONTROL_DT_S
-from sim.world.rendering import greys
+from sim.world.rendering import greys, surfaces
 from sim.world.world import World
 
 __all__ = ["LiveView"]
@@ -84,6 +84,8 @@ class LiveView:
         self._world, self._shown = world, self._looks(world.model)
         self._state = np.empty(mujoco.mj_stateSize(world.model, STATE))
         model = copy.copy(world.model)
+        for geom, material in surfaces(model).items():
+            model.geom_matid[geom] = material
         for geom, grey in greys(world.scene).items():
             model.geom_matid[geom] = -1
             model.geom_rgba[geom] = (grey, grey, grey, 1.0)

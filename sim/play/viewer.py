@@ -9,7 +9,10 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import signal
+import socket
 import threading
+import time
 from multiprocessing.connection import Connection
 from typing import Any, Final
 
@@ -50,6 +53,7 @@ def serve(pipe: Connection, model: mujoco.MjModel, port: int) -> None:
         model: what is shown first.
         port: TCP port, 0 for a free one.
     """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one
     endpoint, sender = launch_thread.make_thread_endpoints()
     with contextlib.redirect_stdout(io.StringIO()):
         viewer = _Viewer(viewer_protocol.ViewerConfig(gfx="web", http_port=port), endpoint, model=model)
@@ -57,6 +61,10 @@ def serve(pipe: Connection, model: mujoco.MjModel, port: int) -> None:
         viewer.camera.lookat[:] = model.stat.center
         viewer.camera.distance = _DISTANCE * model.stat.extent
         viewer.camera.azimuth, viewer.camera.elevation = _AZIMUTH, _ELEVATION
+        while True:  # its server listens a moment after it has started
+            with contextlib.suppress(ConnectionRefusedError), socket.create_connection((HOST, viewer.port)):
+                break
+            time.sleep(0.02)
         pipe.send(viewer.port)
 
         def pass_on() -> None:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from sim.scene.catalogue import Catalogue, MovingSpec, ObjectType, Part, load_catalogue
 from sim.scene.rooms import Room, load_room
+from sim.scene.surfaces import add_surfaces
 
 #: Geoms that show spilled liquid, see `sim.world.liquids`.
 PUDDLES: Final = 6
@@ -231,6 +232,7 @@ def _add_room(spec: mujoco.MjSpec, room: Room, catalogue: Catalogue) -> None:
     )
     floor = spec.add_material(name="floor", texrepeat=[1.0, 1.0], texuniform=True, specular=0.0)
     floor.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = "tiles"
+    add_surfaces(spec, room.floor_colors)
     x0, y0, x1, y1 = room.bounds
     cx, cy, hx, hy, h = (x0 + x1) / 2, (y0 + y1) / 2, (x1 - x0) / 2, (y1 - y0) / 2, room.wall_height
     world = spec.worldbody

@@ -104,12 +104,16 @@ class _Key:
         return hash(self.name)
 
 
-@functools.lru_cache(maxsize=24)
-def _canvas(key: _Key, height: int, width: int, samples: int, thread: int) -> Canvas:
-    del thread  # an OpenGL context is current in one thread only
-    return Canvas(key.model, height, width, samples)
+class _Canvases(threading.local):
+    """A thread's canvases: a context is current in one thread, and has to be given up there."""
+
+    def __init__(self) -> None:
+        self.of = functools.lru_cache(maxsize=24)(lambda key, *shape: Canvas(key.model, *shape))
+
+
+_canvases = _Canvases()
 
 
 def shared_canvas(model: mujoco.MjModel, name: str, height: int, width: int, samples: int = 0) -> Canvas:
     """The thread's canvas for a robot and room (`name` stands for their meshes and textures) at a size."""
-    return _canvas(_Key(model, name), height, width, samples, threading.get_ident())
+    return _canvases.of(_Key(model, name), height, width, samples)

@@ -1,7 +1,7 @@
 """Offscreen pictures of a world: RGB, metric depth and instance segmentation of one camera at one size.
 
 The OpenGL backend is chosen in `sim.gl`: EGL unless MUJOCO_GL says otherwise, OSMesa where EGL is missing.
-Planner images have no shadows, reflections or multisampling (measured on two shared CPU cores: 10 x and 3 x). Paper:
+Planner images have no shadows, reflections, textures or multisampling (measured on two shared CPU cores: 10 x and 3 x). Paper:
 first-person and third-person cameras of DualTHOR. Left out: camera noise and lens distortion.
 
 Camera frame: x right, y down, z forward. Shape letters: H rows, W columns.
@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.gl import RenderingError
+from sim.scene.catalogue import load_catalogue
+from sim.scene.surfaces import FLOOR, PLASTER, SURFACES
 from sim.world.canvas import shared_canvas
 from sim.world.poses import ObjectPoses
 from sim.world.scene_state import SceneState
@@ -33,6 +35,7 @@ __all__ = [
     "camera_intrinsics",
     "camera_pose",
     "greys",
+    "surfaces",
 ]
 
 CAMERAS: Final = ("head", "front", "left", "right", "behind", "top", "overview", "plan")
@@ -45,6 +48,8 @@ _MAX_GEOMS: Final = 1500
 _SAMPLES: Final = 8
 _HEADLIGHT, _FILL = 0.75, 0.5
 _LAMP, _LAMP_ABOVE_M = 0.5, 1.0
+#: Height and thickness of skirting boards.
+_SKIRTING_M: Final = (0.09, 0.012)
 #: Greys of black robots: brighter ones are left alone; parts with a larger radius are shells.
 _BLACK, _SHELL, _JOINT, _SHELL_M = 0.25, 0.68, 0.3, 0.14
 #: A camera of the room that stands in for one that is put somewhere for a picture.
@@ -138,6 +143,21 @@ def greys(scene: SceneState) -> dict[int, float]:
     return found
 
 
+def surfaces(model: mujoco.MjModel) -> dict[int, int]:
+    """Materials for people, by geom: the floor's, the walls', and those of the catalogue's colours."""
+    materials = {str(model.material(index).name): index for index in range(model.nmat)}
+    colors = {name: np.array(rgba[:3], dtype=np.float32) for name, rgba in load_catalogue().colors.items() if name in SURFACES}
+    found = {int(model.geom("floor").id): materials[FLOOR]}
+    for geom in range(model.ngeom):
+        if model.geom(geom).name.startswith("wall_"):
+            found[geom] = materials[PLASTER]
+        elif model.geom_matid[geom] < 0:
+            same = (name for name, rgb in colors.items() if np.array_equal(model.geom_rgba[geom, :3], rgb))
+            if (name := next(same, None)) is not None:
+                found[geom] = materials[SURFACES[name]]
+    return found
+
+
 class Renderer:
     """Draws a world at one size.
 
@@ -145,7 +165,8 @@ class Renderer:
         scene: what is drawn; it may advance between calls.
         height: rows, at most 1280.
         width: columns, at most 1280.
-        pretty: a lamp at the ceiling that casts shadows, and smooth edges, for people; planners get plain pictures.
+        pretty: a lamp at the ceiling that casts shadows, surfaces of wood, fabric and plaster, skirting boards, and smooth
+            edges, for people; planners get plain pictures.
 
     Raises:
         ValueError: on a size outside 1..1280.
@@ -167,6 +188,7 @@ class Renderer:
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._drawn.flags[int(flag)] = int(pretty)
         self._shades = greys(scene) if pretty else {}
+        self._surfaces = surfaces(scene.model) if pretty else {}
         self._planes = np.flatnonzero(scene.model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))
         robot = np.isin(scene.model.geom_bodyid, list(scene.robot_bodies))
         labels = np.where(robot, _ROBOT, scene.object_of_geom).astype(np.int32)
@@ -205,13 +227,31 @@ class Renderer:
             groups[self._out_of_view(index)] = _UNSEEN_GROUP
         outside = self._seen_from_behind(pose[:3, 3])
         groups[outside] = _UNSEEN_GROUP
+        plain = scene.model.geom_matid.copy()
+        scene.model.geom_matid[list(self._surfaces)] = list(self._surfaces.values())
         self._drawn.flags[int(mujoco.mjtRndFlag.mjRND_SKYBOX)] = int(len(outside) > 0)
         mujoco.mjv_updateScene(scene.model, scene.data, self._option, None, self._camera, everything, self._drawn)
-        groups[:] = kept
+        groups[:], scene.model.geom_matid[:] = kept, plain
         scene.data.cam_xpos[index] = place
         if self._pretty:
+            self._add_skirting(set(outside.tolist()))
             self._light()
         return pose
+
+    def _add_skirting(self, outside: set[int]) -> None:
+        """A board along the foot of each wall that is seen."""
+        model, data = self._scene.model, self._scene.data
+        for wall in self._planes:
+            if not model.geom(int(wall)).name.startswith("wall_") or int(wall) in outside:
+                continue
+            half, turn = model.geom_size[wall], data.geom_xmat[wall].reshape(3, 3)
+            foot = data.geom_xpos[wall] - turn[:, 1] * (half[1] - _SKIRTING_M[0] / 2.0)
+            board = self._drawn.geoms[self._drawn.ngeom]
+            self._drawn.ngeom += 1
+            size = np.array([half[0], _SKIRTING_M[0] / 2.0, _SKIRTING_M[1]])
+            colour = np.array([0.92, 0.92, 0.90, 1.0], dtype=np.float32)
+            mujoco.mjv_initGeom(board, int(mujoco.mjtGeom.mjGEOM_BOX), size, foot, data.geom_xmat[wall], colour)
+            board.segid = -1
 
     def _light(self) -> None:
         """A lamp over the middle of the ceiling that alone casts shadows, and little light from everywhere."""

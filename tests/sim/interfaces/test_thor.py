@@ -178,5 +178,23 @@ def test_scenes_and_options() -> None:
         Controller(scene="FloorPlan99")
     with pytest.raises(ValueError, match="unknown option 'gravity'"):
         Controller(gravity=3)
-    with pytest.raises(ValueError, match="fieldOfView 20 is not that of the head camera"):
-        Controller(scene="FloorPlan401", fieldOfView=20, width=32, height=32)
+    with pytest.raises(ValueError, match="field_of_view 175 outside"):
+        Controller(scene="FloorPlan401", fieldOfView=175, width=32, height=32)
+
+
+def test_field_of_view_and_heading() -> None:
+    with (
+        Controller(scene="FloorPlan401", fieldOfView=90, width=64, height=64) as wide,
+        Controller(scene="FloorPlan401", width=64, height=64) as own,
+    ):
+        for one in (wide, own):
+            for _ in range(2):
+                heading = one.step("Rotate", rotation={"x": 0, "y": 120, "z": 0}).metadata["agent"]["rotation"]["y"]
+                assert heading == pytest.approx(120.0, abs=0.5)
+        assert wide.last_event.metadata["fov"] == 90.0 and own.last_event.metadata["fov"] < 80.0
+        # the middle of the wide picture shows what the narrow one does
+        share = np.tan(np.radians(own.last_event.metadata["fov"] / 2)) / np.tan(np.radians(45.0))
+        cut = round(32 * (1 - share))
+        middle = wide.last_event.depth_frame[cut:-cut, cut:-cut]
+        assert np.median(middle) == pytest.approx(np.median(own.last_event.depth_frame), rel=0.05)
+        assert wide.reset().metadata["fov"] == 90.0

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+from concurrent.futures import ThreadPoolExecutor
+
 import mujoco
 import numpy as np
 import pytest
@@ -175,3 +178,17 @@ def test_the_lamp_shines_through_the_ceiling(world: World, camera: str) -> None:
     plain, pretty = (world.cameras.render(camera, 120, 160, pretty=one).rgb.astype(int) for one in (False, True))
     floor = slice(90, 120)
     assert pretty[floor].mean() > 0.85 * plain[floor].mean()
+
+
+def test_canvases_of_other_threads_harm_no_other() -> None:
+    def seen() -> tuple[np.ndarray, np.ndarray]:
+        view = World(None, "bathroom_1").cameras.render("overview", 50, 50, segmentation=True)
+        assert view.segmentation is not None
+        return view.rgb, view.segmentation
+
+    mine = seen()
+    for _ in range(3):
+        with ThreadPoolExecutor(1) as pool:
+            assert all(np.array_equal(*pair) for pair in zip(pool.submit(seen).result(), mine, strict=True))
+    gc.collect()
+    assert all(np.array_equal(*pair) for pair in zip(seen(), mine, strict=True))
