@@ -15,7 +15,7 @@ QUICK := tests/configs tests/data/interface tests/model tests/planners tests/rep
   $(addprefix --ignore=tests/,$(addprefix report/test_,export.py figures.py notebook.py reconstruction.py tokenizer.py video.py) \
   $(addprefix planners/,chat/dag_plan/test_episode.py scripted/test_planner.py test_released.py))
 
-.PHONY: setup eval test test-slow quick check release-check serve motions lock pictures docs third-party clean
+.PHONY: setup eval test test-slow quick check release-check serve motions lock pictures docs reproduce third-party clean
 
 setup: $(STAMP)
 
@@ -75,6 +75,10 @@ pictures: $(STAMP)
 docs: $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint requirements.lock --editable ".[docs]"
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
+# A table of the paper: runs what is missing, says how long that takes first. TABLE=main, replanning, ablation, failures, distributions
+reproduce: $(STAMP)
+	$(BIN)/python -m tools.reproduce table=$(or $(TABLE),main)
 
 third-party: $(STAMP)
 	$(BIN)/python tools/third_party.py > THIRD_PARTY.md

@@ -32,6 +32,7 @@ COMMANDS: Final = {
     "html": ("proprio_mllm.report.html", "runs as one page with every episode: RUN ..."),
     "strip": ("proprio_mllm.report.strip", "one episode as a strip of pictures: RUN TASK"),
     "video": ("proprio_mllm.report.video", "one episode as a film: RUN TASK"),
+    "replay": ("proprio_mllm.report.replay", "one episode again in the browser, step by step: RUN TASK"),
     "export": ("proprio_mllm.report.export", "runs as training rows or JSON lines: RUN ..."),
     "tokenizers": ("proprio_mllm.report.tokenizer", "what motion tokenizers keep: TOKENIZER ..."),
     "reconstruction": (

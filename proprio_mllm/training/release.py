@@ -3,6 +3,7 @@
     weights/<model>/<name>/     what `building.save_model` wrote, and
         provenance.json         seed, keys and hashes of data and configuration, versions, and for every stage that went into
                                 the model its command and its metrics
+        README.md               the same for people, in Hugging Face's format
 
 Weights are stored as float16, half the size; they are read back as float32. A variant's backbone is the base model's, which is
 released beside it, so that its own folder holds only what training moved. The motion tokenizer keeps its precision, so that
@@ -24,6 +25,7 @@ from safetensors.torch import load_file, save_file
 
 from data.files import new_folder
 from proprio_mllm.model.building import share_backbone
+from proprio_mllm.training.card import model_card
 from proprio_mllm.training.paths import finished_key
 from proprio_mllm.training.pipeline import Pipeline
 from proprio_mllm.training.sources import shard_hash
@@ -76,8 +78,9 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
             _shrink(work)
             if stage not in ("practice", "base") and (work / "vlm").is_dir():
                 share_backbone(work, target.with_name(release_name("base", "")))
-            provenance = json.dumps(_provenance(pipeline, stage, key), indent=1)
-            (work / "provenance.json").write_text(provenance + "\n", encoding="utf-8")
+            provenance = _provenance(pipeline, stage, key)
+            (work / "provenance.json").write_text(json.dumps(provenance, indent=1) + "\n", encoding="utf-8")
+            (work / "README.md").write_text(model_card(provenance), encoding="utf-8")
             size = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) / 1e6
             if size > LARGEST_MB:
                 raise ValueError(f"{target}: {size:.1f} MB; at most {LARGEST_MB:g} MB are released")

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
+from configs.compose import compose
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
+from configs.validate import build
 from data.interface.observation import Observation
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.evaluation.sessions import open_session
@@ -19,6 +22,7 @@ from proprio_mllm.planners.protocol import TaskInfo
 from proprio_mllm.planners.random_planner import RandomPlanner
 from proprio_mllm.planners.registry import make_planner
 from proprio_mllm.planners.words import WordsPlanner
+from proprio_mllm.training.card import model_card
 from sim.tasks.task import load_benchmark, write_tasks
 
 WEIGHTS = Path(__file__).parents[2] / "weights" / "tiny"
@@ -76,7 +80,7 @@ def test_it_plans_with_the_parts_of_its_name(name: str, first: Observation) -> N
 def test_it_says_where_it_comes_from(name: str) -> None:
     files = [path for path in (WEIGHTS / name).rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < 30e6
-    assert {path.suffix for path in files} <= {".json", ".jinja", ".safetensors"}
+    assert {path.suffix for path in files} <= {".json", ".jinja", ".md", ".safetensors"}
     note = json.loads((WEIGHTS / name / "provenance.json").read_text())
     assert note["seed"] == 0
     assert {"views", "clips"} <= set(note["shards"])
@@ -85,6 +89,16 @@ def test_it_says_where_it_comes_from(name: str) -> None:
         assert stage["command"].startswith("python train.py stage=")
         assert stage["metrics"]["seconds"] > 0
     assert name.startswith("base") or note["variant"] == name
+
+
+@pytest.mark.parametrize("name", ["words", "base", "full"])
+def test_its_card_says_what_its_provenance_does(name: str) -> None:
+    text = (WEIGHTS / name / "README.md").read_text()
+    assert text == model_card(json.loads((WEIGHTS / name / "provenance.json").read_text()))
+    _, front, body = text.split("---\n", 2)
+    assert yaml.safe_load(front)["license"] == "apache-2.0" and f"# Proprio-MLLM tiny, {name}" in body
+    (command,) = (line.split("eval.py ")[1].split() for line in body.splitlines() if line.startswith("    python eval.py"))
+    assert build(EvalConfig, compose("eval", command)).planner.kind == "mllm"
 
 
 def test_the_model_plans_alike_alone_and_in_a_batch(tmp_path: Path) -> None:

@@ -1,0 +1,65 @@
+"""Model cards in Hugging Face's format, from the provenance that lies beside released weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+__all__ = ["model_card"]
+
+_ABOUT: Final = {
+    "practice": "A language model from scratch that plans in words: it reads the episode so far and answers with a plan step.",
+    "base": "The language model of `words` that has learnt to see; it stands in for a pretrained Qwen2.5-VL at this size.",
+    "alignment": "The base model with motion tokens, motion-based position embedding, cross-spatial encoder (paper, stage 2).",
+    "selu": "The aligned model after self-learning (paper, stage 3).",
+}
+_PLANNERS: Final = {"practice": "words", "base": "base"}
+
+
+def model_card(provenance: Mapping[str, Any]) -> str:
+    """The text of `README.md` in a folder of released weights.
+
+    Args:
+        provenance: as in `provenance.json`.
+    """
+    stage, model = provenance["stage"], provenance["config"]["model"]["name"]
+    planner = _PLANNERS.get(stage, "proprio")
+    name = planner if stage in _PLANNERS else provenance["variant"]
+    variant = f" variant={provenance['variant']}" if stage not in _PLANNERS and provenance["variant"] != "full" else ""
+    rows = [
+        f"| {one} | {key} | {value:.4g} |"
+        for one, record in provenance["stages"].items()
+        for key, value in record["metrics"].items()
+        if key != "seconds" and not key.endswith(("/steps", "/seconds"))
+    ]
+    commands = "\n".join(f"    {record['command']}" for record in provenance["stages"].values())
+    shards = ", ".join(f"{kind} `{key}`" for kind, key in provenance["shards"].items())
+    return f"""---
+license: apache-2.0
+library_name: proprio-mllm
+pipeline_tag: robotics
+language: en
+tags: [embodied-planning, dual-arm, humanoid, mujoco]
+---
+
+# Proprio-MLLM {model}, {name}
+
+{_ABOUT[stage]} For the humanoids Unitree H1 and AgiBot X1 in the household simulator of this project.
+
+    python eval.py planner={planner} robot=h1{variant}
+
+**Trained** on what the simulator and the project's rules make, and on nothing else: no text or picture of people. Seed
+{provenance["seed"]}; shards {shards}. Stored as {provenance["stored_as"]}.
+
+{commands}
+
+**Measured** on held-out data while training; success on the benchmark's 359 tasks is in `docs/benchmark.md`.
+
+| stage | metric | value |
+|---|---|---|
+{chr(10).join(rows)}
+
+**Limits.** It knows this simulator's actions, codes and instructions in English, and no others; it says nothing about what is
+safe for people or property, and has never driven a robot. It is of a size for tests on a laptop and not comparable with the
+paper's 7B model.
+"""
