@@ -3,6 +3,10 @@
 An `Example` is a conversation and the views it shows. The collator expands each image's pad, computes the position ids of the
 configured MPE mode and masks the labels. Long examples are refused, never cut: a cut inside an image would misalign features.
 
+Motion that a prompt shows stands beside the text: it takes the positions before the one at which it begins, and the text goes
+on there, as far from what it answers as without it. (Decisions that have to read across 50 positions more lose half of their
+exactness before training, and a part of it after.) Motion that is learnt, or generated, takes positions as text does.
+
 Shape letters: B batch, S sequence, I images of the batch, P patches, H and W image rows and columns.
 """
 
@@ -24,6 +28,7 @@ from proprio_mllm.model.chat import Encoded, Message, encode
 from proprio_mllm.model.geometry import centroid
 from proprio_mllm.model.mpe import Centroid, position_ids
 from proprio_mllm.model.processor import ProprioProcessor
+from proprio_mllm.model.vocabulary import MOTION_END, MOTION_START
 
 __all__ = ["Batch", "Collator", "Example", "ImageBatch", "Movable", "View"]
 
@@ -152,6 +157,8 @@ class Collator:
         self.cfg = cfg
         self.max_tokens = max_tokens
         self.image_token: int = processor.tokenizer.get_vocab()[processor.image_token]
+        vocabulary = processor.tokenizer.get_vocab()
+        self._motion = vocabulary.get(MOTION_START), vocabulary.get(MOTION_END)
         self._merge = int(processor.image_processor.merge_size)
 
     def images(self, views: Sequence[View]) -> ImageBatch:
@@ -233,9 +240,22 @@ class Collator:
             places = images.centroids[first : first + named] if images else ()
             grids = [images.grid] * named if images else []
             where = position_ids(ids, self.image_token, grids, places, self.cfg.mpe.mode, example.start)
+            if self.cfg.episodes:  # models of version 0.1 have learnt to read across it
+                self._put_beside(ids, labels, where)
             rows.append((ids, labels, where))
             first += named
         return self._pad(rows, images, side)
+
+    def _put_beside(self, ids: Sequence[int], labels: Sequence[int], where: Tensor) -> None:
+        """Moves the positions (3, S) of motion that is not learnt, and of what follows it, back by the motion's length."""
+        begin, end = self._motion
+        start = None
+        for index, (token, label) in enumerate(zip(ids, labels, strict=True)):
+            if label == IGNORE and token == begin:
+                start = index
+            elif token == end and start is not None:
+                where[:, start:] -= index + 1 - start
+                start = None
 
     def _expand(self, ids: Sequence[int], targets: Sequence[bool], grid: tuple[int, int]) -> tuple[list[int], list[int]]:
         out: list[int] = []

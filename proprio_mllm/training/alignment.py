@@ -2,15 +2,15 @@
 
 | phase | pairs | trains | frozen |
 |---|---|---|---|
-| text (2a-i) | motion to text, motion to body state, text to motion, masked motion | motion rows, LoRA | vision, merger, CSE |
+| text (2a-i) | motion to text, to body state and back, masked motion, replay | motion rows, LoRA | vision, merger, CSE |
 | image (2a-ii) | motion and image to text | motion rows, CSE, MPE | language model's LoRA, vision |
 | joint (2b) | all of them | motion rows, LoRA, CSE, MPE, merger | vision, backbone |
 
 "Freeze the image and text weights separately" leaves open which weights; this reading freezes one modality's while the
 other's pairs train. Besides clip captions, motion and image to text holds questions about the robot's own body in its scene
 (which arm reaches an object, how far the body must go down), and motion to text asks which hands are open and how high the
-pelvis is, which captions do not say and planning needs. A share of decisions, with motion tokens before their answers, and of
-episodes in words keeps what was learnt before; the paper does not mention any such replay.
+pelvis is, which captions do not say and planning needs. Wherever LoRA trains, a share of decisions, with motion tokens before
+their answers, and of episodes in words keeps what was learnt before; the paper does not mention any such replay.
 
 The control `variant=no_proprio` has the joint phase alone, and of its pairs those that need no motion.
 """
@@ -62,10 +62,11 @@ class Phase:
 
 
 PHASES: Final[Mapping[str, Phase]] = {
-    "text": Phase(("rows", "lora"), ("say", "feel", "do", "fill")),
+    "text": Phase(("rows", "lora"), ("say", "feel", "feel", "feel", "do", "fill", "plan")),
     "image": Phase(("rows", "cse", "mpe"), ("say_image", "body")),
     "joint": Phase(
-        ("rows", "lora", "cse", "mpe", "merger"), ("say", "feel", "do", "fill", "say_image", "body", "body", "body", "plan")
+        ("rows", "lora", "cse", "mpe", "merger"),
+        ("say", "feel", "feel", "do", "fill", "say_image", "body", "body", "body", "plan"),
     ),
 }
 
@@ -146,9 +147,7 @@ class AlignmentData:
 
     def _body(self, index: int, rng: np.random.Generator) -> Example:
         row = self.views.row(index)
-        half = self._cfg.questions // 2
-        pairs = self.views.pairs(row, BODY_RELATIVE, self._cfg.questions - half, rng)
-        pairs += self.views.pairs(row, GROUNDING, half, rng)
+        pairs = self.views.pairs(row, (*GROUNDING, *BODY_RELATIVE), self._cfg.questions, rng)
         codes = self.tokenizer.encode_window(row.motion) if self._proprioception else None
         return Example(looking(pairs or [self.views.listing(row)], codes, self._style), (row.view,))
 
