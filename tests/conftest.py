@@ -10,8 +10,11 @@ os.environ["WANDB_MODE"] = "disabled"
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import socket
+from collections.abc import Iterator
 
 import pytest
+
+from tests.browser import Browser, chromium
 
 
 @pytest.fixture(autouse=True)
@@ -26,3 +29,14 @@ def _loopback_only(monkeypatch: pytest.MonkeyPatch) -> None:
         connect(self, address)  # type: ignore[arg-type]
 
     monkeypatch.setattr(socket.socket, "connect", guarded)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """A headless Chromium; where there is none, the test is skipped."""
+    program = chromium()
+    if program is None:
+        pytest.skip("no Chromium here; install the package `chromium`")
+    one = Browser(program)
+    yield one
+    one.close()

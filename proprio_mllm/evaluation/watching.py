@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 from tqdm import tqdm
 
 from proprio_mllm.evaluation.episode import RunnableSession
@@ -35,18 +33,21 @@ class Watching:
         self._task, self._text = job.task.instruction, ""
         if opened.session is not self._watched:
             self._watched = opened.session
-            opened.session.watchers.append(functools.partial(self._tick, opened.session))
+            opened.session.watchers.append(self._tick)
         return opened
 
     def close(self) -> None:
-        """Closes the view."""
+        """Closes the view; sessions outlive a run."""
+        if self._watched is not None:
+            self._watched.watchers.remove(self._tick)
         if self._view is not None:
             self._view.close()
 
-    def _tick(self, session: Session, world: World, text: str) -> None:
+    def _tick(self, world: World, text: str) -> None:
         del world
+        assert self._watched is not None
         if self._view is None:
-            self._view = LiveView(session, speed=_SPEED)
+            self._view = LiveView(self._watched, speed=_SPEED)
             tqdm.write(f"watch: {self._view.url}")
         if not self._text:
             tqdm.write(self._task)

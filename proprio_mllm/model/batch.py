@@ -156,8 +156,8 @@ class Collator:
         self.tokenizer = processor.tokenizer
         self.cfg = cfg
         self.max_tokens = max_tokens
-        self.image_token: int = processor.tokenizer.get_vocab()[processor.image_token]
         vocabulary = processor.tokenizer.get_vocab()
+        self.image_token: int = vocabulary[processor.image_token]
         self._motion = vocabulary.get(MOTION_START), vocabulary.get(MOTION_END)
         self._merge = int(processor.image_processor.merge_size)
 

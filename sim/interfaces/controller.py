@@ -14,7 +14,6 @@ GetInteractablePoses, SetObjectPoses, InitialRandomSpawn.
 from __future__ import annotations
 
 import textwrap
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Self
@@ -30,6 +29,7 @@ from sim.interfaces.aliases import number, to_action
 from sim.interfaces.poses import interactable_poses, random_placements, set_object_poses
 from sim.scene.rooms import load_room
 from sim.session.session import FreePlay, Session, SessionSnapshot, TaskLike
+from sim.session.undo import UndoHistory
 from sim.skills.navigation import wrap_angle
 from sim.world.metadata import world_metadata
 from sim.world.rendering import MAX_SIZE
@@ -216,8 +216,7 @@ class Controller(Stopped):
         self._shape, self._seed = (height, width), seed
         self._cameras, self._privileged = tuple(third_party_cameras), privileged
         self._task: TaskLike = FreePlay(scene) if task is None else task
-        self._undo: deque[SessionSnapshot] = deque(maxlen=undo_limit)
-        self._redo: deque[SessionSnapshot] = deque(maxlen=undo_limit)
+        self._history = UndoHistory(undo_limit)
         self._saved: dict[str, SessionSnapshot] = {}
         self.last_event = self.reset()
 
@@ -239,8 +238,7 @@ class Controller(Stopped):
         self.session.reset(task, self._seed)
         if self._fov is not None:
             self.session.world.model.camera(self.session.robot.head_camera).fovy = self._fov
-        self._undo.clear()
-        self._redo.clear()
+        self._history.clear()
         self._saved = {}
 
     def step(self, action: str | Mapping[str, Any] | None = None, raise_for_failure: bool = False, **arguments: Any) -> Event:
@@ -293,8 +291,7 @@ class Controller(Stopped):
         return self._act(steps, " & ".join(action.name for action in actions))
 
     def _act(self, steps: Sequence[PlanStep], name: str) -> Event:
-        self._undo.append(self.session.snapshot())
-        self._redo.clear()
+        self._history.add(self.session.snapshot())
         outcomes: list[ActionOutcome] = []
         for step in steps:
             _, feedback = self.session.step(step)
@@ -311,8 +308,8 @@ class Controller(Stopped):
         if name in _PRIVILEGED and not self._privileged:
             raise ValueError(f"{name} needs Controller(privileged=True), got privileged=False")
         handlers: Mapping[str, Callable[[Mapping[str, Any]], Any]] = {
-            "Undo": lambda _: self._travel(self._undo, self._redo),
-            "Redo": lambda _: self._travel(self._redo, self._undo),
+            "Undo": lambda _: self._history.undo(self.session),
+            "Redo": lambda _: self._history.redo(self.session),
             "SaveState": self._save,
             "LoadState": self._load,
             "Reset": lambda c: self.reset(c.get("scene"), c.get("seed")) and None,
@@ -326,14 +323,6 @@ class Controller(Stopped):
         result = handlers[name](call)
         self.last_event = self._event(name, (), result)
         return self.last_event
-
-    def _travel(self, source: deque[SessionSnapshot], target: deque[SessionSnapshot]) -> bool:
-        """Moves along the undo history; False when there is nothing to go to."""
-        if not source:
-            return False
-        target.append(self.session.snapshot())
-        self.session.restore(source.pop())
-        return True
 
     def _save(self, call: Mapping[str, Any]) -> str:
         name = str(call.get("name", "default"))
@@ -376,8 +365,7 @@ class Controller(Stopped):
             raise ValueError(f"SetObjectPoses: objectPoses must be a list of mappings, got {str(poses)[:80]!r}")
         before = self.session.snapshot()
         set_object_poses(self.session.world, poses)
-        self._undo.append(before)
-        self._redo.clear()
+        self._history.add(before)
         return True
 
     def _spawn(self, call: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -409,8 +397,7 @@ class Controller(Stopped):
         body = self.session.body
         if body.hands.at_furniture() or not body.workspace.navigation().is_free(np.array([x, y])):
             return False
-        self._undo.append(self.session.snapshot())
-        self._redo.clear()
+        self._history.add(self.session.snapshot())
         self.session.teleport(x, y, yaw)
         return True
 

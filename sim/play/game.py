@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import logging
 import threading
-from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,7 +23,8 @@ from sim.play.live import LiveView
 from sim.robots.spec import available_robots
 from sim.scene.rooms import room_names
 from sim.session.contingency import DIFFICULTIES
-from sim.session.session import FreePlay, Session, SessionSnapshot, TaskLike
+from sim.session.session import FreePlay, Session, TaskLike
+from sim.session.undo import UndoHistory
 from sim.skills.facts import WorldFacts
 from sim.tasks.task import Task, load_benchmark
 
@@ -85,8 +85,7 @@ class Game:
     def __init__(self, config: PlayConfig) -> None:
         self._config = config
         self._tasks: dict[str, Task] = {task.id: task for task in load_benchmark()}
-        self._undo: deque[SessionSnapshot] = deque(maxlen=_UNDO)
-        self._redo: deque[SessionSnapshot] = deque(maxlen=_UNDO)
+        self._past = UndoHistory(_UNDO)
         self._pool = ThreadPoolExecutor(1, "simulator")
         self._lock = threading.Lock()
         self._session: Session | None = None
@@ -94,9 +93,10 @@ class Game:
         self._status: dict[str, Any] = {}
         self._head = b""
         self._doing, self._version = "", 0
-        first = (config.robot, config.room, config.task, config.difficulty, config.seed)
+        first = (config.robot, config.room, config.task, config.difficulty)
+        self._check(*first)
         try:
-            self._pool.submit(self._begin, *first).result()
+            self._pool.submit(self._begin, *first, config.seed).result()
         except BaseException:
             self._pool.shutdown()
             raise
@@ -146,11 +146,11 @@ class Game:
 
     def undo(self) -> None:
         """Takes the last step back."""
-        self._start("undo", self._travel, self._undo, self._redo)
+        self._start("undo", self._travel, self._past.undo)
 
     def redo(self) -> None:
         """Takes it again."""
-        self._start("redo", self._travel, self._redo, self._undo)
+        self._start("redo", self._travel, self._past.redo)
 
     def begin(self, robot: str, room: str, task: str | None, difficulty: str, seed: int) -> None:
         """Starts another episode.
@@ -159,6 +159,15 @@ class Game:
             ValueError: on an unknown name.
             BusyError: while a step runs.
         """
+        self._check(robot, room, task, difficulty)
+        self._start("a new episode", self._begin, robot, room, task, difficulty, seed)
+
+    def close(self) -> None:
+        """Ends it, after the step that runs."""
+        self._pool.submit(self._end).result()
+        self._pool.shutdown()
+
+    def _check(self, robot: str, room: str, task: str | None, difficulty: str) -> None:
         for kind, name, names in (
             ("robot", robot, available_robots()),
             ("room", room, room_names()),
@@ -167,12 +176,6 @@ class Game:
         ):
             if name is not None and name not in names:
                 raise ValueError(f"unknown {kind} {name!r}; {allowed_values(name, names)}")
-        self._start("a new episode", self._begin, robot, room, task, difficulty, seed)
-
-    def close(self) -> None:
-        """Ends it, after the step that runs."""
-        self._pool.submit(self._end).result()
-        self._pool.shutdown()
 
     def _start(self, doing: str, work: Callable[..., None], *arguments: Any) -> None:
         with self._lock:
@@ -194,8 +197,6 @@ class Game:
     # ---- in the simulator's thread
 
     def _begin(self, robot: str, room: str, task: str | None, difficulty: str, seed: int) -> None:
-        if task is not None and task not in self._tasks:
-            raise ValueError(f"unknown task {task!r}; {allowed_values(task, tuple(self._tasks))}")
         wanted: TaskLike = FreePlay(room) if task is None else self._tasks[task]
         session = Session(robot, difficulty, image_size=0, all_known=True)
         session.reset(wanted, seed)
@@ -206,8 +207,7 @@ class Game:
             self._running().close()
         self._session = session
         self._goals = [] if task is None else [goal.to_text() for goal in self._tasks[task].goals]
-        self._undo.clear()
-        self._redo.clear()
+        self._past.clear()
         self._chosen = {"robot": robot, "room": wanted.room, "task": task, "difficulty": difficulty, "seed": seed}
         self._look()
 
@@ -220,15 +220,11 @@ class Game:
         session = self._running()
         before = session.snapshot()
         session.act(step)
-        self._undo.append(before)
-        self._redo.clear()
+        self._past.add(before)
         self._look()
 
-    def _travel(self, source: deque[SessionSnapshot], target: deque[SessionSnapshot]) -> None:
-        if source:
-            session = self._running()
-            target.append(session.snapshot())
-            session.restore(source.pop())
+    def _travel(self, way: Callable[[Session], bool]) -> None:
+        if way(self._running()):
             self._look()
 
     def _running(self) -> Session:
@@ -257,8 +253,8 @@ class Game:
             "height_m": round(float(session.body.posture.pelvis_height_m), 2),
             "objects": [{"id": name, "visible": name in visible, "can": can} for name, can in self._possible().items()],
             "history": [{"step": one.step, "feedback": one.feedback} for one in session.history],
-            "undo": len(self._undo),
-            "redo": len(self._redo),
+            "undo": len(self._past.past),
+            "redo": len(self._past.future),
             "error": "",
         }
         with self._lock:

@@ -47,7 +47,8 @@ def application(game: Game) -> Starlette:
         async def answer(request: Request) -> Response:
             if request.headers.get("content-type", "").split(";")[0] != "application/json":
                 return JSONResponse({"error": "content-type must be application/json"}, 415)
-            if int(request.headers.get("content-length") or _MAX_BODY + 1) > _MAX_BODY:
+            length = request.headers.get("content-length", "")
+            if not length.isdigit() or int(length) > _MAX_BODY:
                 return JSONResponse({"error": f"a body has at most {_MAX_BODY} bytes, and says how many"}, 413)
             try:
                 await run_in_threadpool(work, await request.json())
@@ -94,7 +95,6 @@ def main(arguments: Sequence[str]) -> int:
     """Command line; serves until interrupted and returns the exit code."""
     config = read_arguments(PlayConfig, arguments)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    sys.stderr.write("starting the room\n")
     with socket.create_server((HOST, config.port)) as listening:
         game = Game(config)
         url = f"http://{HOST}:{listening.getsockname()[1]}/"

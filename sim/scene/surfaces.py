@@ -47,7 +47,7 @@ def add_surfaces(spec: mujoco.MjSpec, floor_colors: Sequence[Sequence[float]]) -
     _add(spec, FLOOR, flat, floor, 1.0 / _FLOOR_M)
     _add(spec, PLASTER, flat, _grey(0.98 + 0.006 * _noise(rng, 16) + 0.012 * _noise(rng, 128)), 1.0 / _PLASTER_M)
     for name, face in (("surface/wood", _wood(rng, _SIDE)), ("surface/fabric", _fabric(rng))):
-        _add(spec, name, cube, np.concatenate([_grey(face)] * 6), None)
+        _add(spec, name, cube, _grey(face), None)  # one square, for all faces of the cube
 
 
 def _add(spec: mujoco.MjSpec, name: str, kind: mujoco.mjtTexture, picture: Picture, repeat: float | None) -> None:

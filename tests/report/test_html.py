@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from proprio_mllm.report.html import main, page, run_data
 from proprio_mllm.report.reenact import RunTasks
 from proprio_mllm.report.runs import load_run
 from sim.tasks.task import write_tasks
-from tests.browser import Browser, chromium
+from tests.browser import Browser
 from tests.report.ledgers import HOSTILE, LAMP, failed, fine, record_of, step, write_run
 
 HEIGHT = failed("Pick(left, Mug_1)", "BodyTooHigh", "body_adjustment", height_m=-0.12, reach_m=0.05)
@@ -181,16 +180,6 @@ def test_what_cannot_be_acted_out_is_said_and_not_kept(acted_run: Path, tmp_path
 
 
 # ---- in a browser
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    program = chromium()
-    if program is None:
-        pytest.skip("no Chromium here; install the package `chromium`")
-    one = Browser(program)
-    yield one
-    one.close()
 
 
 @pytest.fixture(scope="module")

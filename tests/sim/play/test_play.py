@@ -18,7 +18,7 @@ from starlette.testclient import TestClient
 from sim.play.game import Game, PlayConfig
 from sim.play.server import application, main
 from sim.play.viewer import HOST
-from tests.browser import Browser, chromium
+from tests.browser import Browser
 
 PATIENCE_S = 60.0
 
@@ -166,16 +166,6 @@ if __name__ == "__main__":
 def test_wrong_arguments(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*arguments, "port=0", "browser=false"]) == 2
     assert said in capsys.readouterr().err
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    program = chromium()
-    if program is None:
-        pytest.skip("no Chromium here; install the package `chromium`")
-    one = Browser(program)
-    yield one
-    one.close()
 
 
 @pytest.mark.chromium
