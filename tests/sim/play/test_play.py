@@ -72,6 +72,26 @@ def test_a_mug_is_picked_and_picked_again(game: Game) -> None:
     ]
 
 
+def test_what_was_taken_back_is_forgotten_by_another_step(game: Game) -> None:
+    begun(game)
+    act(game, "RotateLeft()")
+    game.undo()
+    assert (waited(game)["undo"], game.status["redo"]) == (0, 1)
+    assert (act(game, "RotateRight()")["undo"], game.status["redo"]) == (1, 0)
+    game.redo()
+    assert [one["step"] for one in waited(game)["history"]] == ["RotateRight()"]
+
+
+def test_the_view_follows_to_another_world_of_the_same_looks(game: Game) -> None:
+    begun(game)
+    assert game._view is not None and game._session is not None
+    before = game._session.world
+    begun(game)
+    assert game._session.world is not before and game._view._world is game._session.world
+    act(game, "MoveAhead()")
+    assert np.array_equal(game._view._state[1 : 1 + len(before.data.qpos)], game._session.world.data.qpos)
+
+
 def test_goals_of_a_task_light_up(game: Game) -> None:
     status = begun(game, task="benchmark_pick_and_toggle_on_21024", room="kitchen_1")
     assert status["room"] == "bedroom_2" and [goal["met"] for goal in status["goals"]] == [False, False]
