@@ -131,10 +131,10 @@ class Batch(Movable):
     images: ImageBatch | None = None
 
     def then(self, tokens: Tensor) -> Batch:
-        """One more token (B,) after each left-padded row, where a cache holds the rows."""
-        ids = tokens[:, None]
-        mask = torch.cat([self.attention_mask, self.attention_mask.new_ones(ids.shape)], dim=1)
-        return Batch(ids, mask, self.position_ids[:, :, -1:] + 1, ids)  # text follows text
+        """More text (B, K) after each left-padded row, where a cache holds the rows."""
+        mask = torch.cat([self.attention_mask, self.attention_mask.new_ones(tokens.shape)], dim=1)
+        after = torch.arange(1, tokens.shape[1] + 1, device=self.position_ids.device)
+        return Batch(tokens, mask, self.position_ids[:, :, -1:] + after, tokens)
 
     @property
     def supervised(self) -> int:

@@ -232,7 +232,7 @@ class ProprioMLLM(nn.Module):
             for row, (value, over) in enumerate(zip(token.tolist(), done.tolist(), strict=True)):
                 if not over:
                     replies[row].append(value)
-            batch = batch.then(token.masked_fill(done, self._pad))
+            batch = batch.then(token.masked_fill(done, self._pad)[:, None])
         return replies
 
     @staticmethod

@@ -18,6 +18,7 @@ from typing import Final
 
 import numpy as np
 import torch
+from peft import PeftModel
 from torch import Tensor
 from transformers import DynamicCache
 
@@ -28,7 +29,7 @@ from data.interface.sightings import Seen
 from data.interface.steps import PlanStep
 from data.interface.symbolic import events_of
 from proprio_mllm.model.batch import Collator, Example
-from proprio_mllm.model.building import load_model, load_motion
+from proprio_mllm.model.building import load_model, load_motion, merge_adapter
 from proprio_mllm.model.chat import Encoded
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
@@ -43,6 +44,9 @@ __all__ = ["WordsPlanner", "WordsState", "plans_in_words"]
 #: Refusals of a step from one stance after which another one is taken.
 _REFUSALS: Final = 2
 _CHOICES: Final = 4
+
+#: Tokens that may follow: the word that each closes, and the words that it begins or goes on with, spelt.
+_Following = dict[int, tuple[str | None, dict[str, list[int]]]]
 
 
 @dataclass(slots=True, kw_only=True)
@@ -132,6 +136,8 @@ class WordsPlanner:
             WeightsError: when the folder has no model.
         """
         model = load_model(check_weights(folder, train), adapter)
+        if isinstance(model.vlm, PeftModel) and model.table.dtype == torch.float32:
+            merge_adapter(model)  # halves a reply; at half precision it would round the adapter off
         device = "cuda" if torch.cuda.is_available() else "cpu"
         return WordsPlanner(model.to(device), load_motion(folder), temperature, insist, reflection)
 
@@ -178,13 +184,17 @@ class WordsPlanner:
         """Continues every answer to its end; what has been read of a log before is not read again for an answer alone."""
         state = answers[0].state if len(answers) == 1 else None
         cache = DynamicCache() if state is None else state.cache
+        for answer in answers:
+            answer.skip()
         batch = self._collator([answer.example(0 if state is None else state.cached) for answer in answers], padding="left")
         while True:
             scores = self.model.following(batch.to(self.model.device), cache).cpu()
-            tokens = [answer.choose(row, self.temperature) for answer, row in zip(answers, scores, strict=True)]
-            if all(token is None for token in tokens):
+            taken = [answer.choose(row, self.temperature) for answer, row in zip(answers, scores, strict=True)]
+            if state is not None:  # in a batch all rows grow by as much
+                taken[0] += answers[0].skip()
+            if all(answer.ended for answer in answers):
                 break
-            batch = batch.then(torch.tensor([self._pad if token is None else token for token in tokens]))
+            batch = batch.then(torch.tensor([tokens or [self._pad] for tokens in taken]))
         if state is not None:
             state.cached = len(state.log)
             state.cache.crop(state.cached - state.cache.get_seq_length())  # minus what is no log
@@ -207,6 +217,7 @@ class _Answer:
         self._begun: list[int] = []
         self._margin = float("inf")
         self._forbidden: dict[Words, set[str]] = {}
+        self._next: _Following | None = None
 
     @property
     def read(self) -> int:
@@ -223,21 +234,16 @@ class _Answer:
         ids = (*self._turn.tokens.ids, *self.begun())[read:]
         return replace(self._turn, tokens=Encoded(ids, (False,) * len(ids)), start=read)
 
-    def choose(self, scores: Tensor, temperature: float) -> int | None:
-        """Takes the next token by the scores (V,) of tokens; None when the answer has ended.
+    @property
+    def ended(self) -> bool:
+        """Whether nothing may follow."""
+        return not self._following()
 
-        Words may be of several tokens, and one may begin as another does (`_1` and `_10`): such a word ends with the first
-        token of the word that follows it.
-        """
-        spelt = self._options(self.words)
-        size = len(self._begun)
-        live = {word: tokens for word, tokens in spelt.items() if tokens[:size] == self._begun}
-        ended = next((word for word, tokens in live.items() if len(tokens) == size), None)
-        after = {} if ended is None else self._options([*self.words, ended])
-        longer = dict.fromkeys(tokens[size] for tokens in live.values() if len(tokens) > size)
-        tokens = list(longer | dict.fromkeys(spelling[0] for spelling in after.values()))
+    def choose(self, scores: Tensor, temperature: float) -> list[int]:
+        """Takes the next token by the scores (V,) of tokens; none when the answer has ended."""
+        tokens = list(self._following())
         if not tokens:
-            return None
+            return []
         values = scores[tokens]
         if temperature > 0.0:
             index = int(torch.multinomial((values / temperature).softmax(-1), 1, generator=self.state.generator))
@@ -245,16 +251,45 @@ class _Answer:
             index = int(values.argmax())
         if len(tokens) > 1:
             self._margin = min(self._margin, float(values[index] - values[torch.arange(len(tokens)) != index].max()))
-        token = tokens[index]
-        if token not in longer:
-            assert ended is not None
-            self._close(ended)
-            live, size = after, 0
+        self._take(tokens[index])
+        return [tokens[index]]
+
+    def skip(self) -> list[int]:
+        """Takes tokens as long as one alone may follow, for which no scores are needed."""
+        taken: list[int] = []
+        while len(following := self._following()) == 1:
+            taken += following
+            self._take(taken[-1])
+        return taken
+
+    def _following(self) -> _Following:
+        """The tokens that may follow, each with the word that it closes, if any, and the spelling of those it goes on with.
+
+        Words may be of several tokens, and one may begin as another does (`_1` and `_10`): such a word ends with the first
+        token of the word that follows it.
+        """
+        if self._next is None:
+            self._next, size = {}, len(self._begun)
+            spelt = self._options(self.words)
+            live = {word: tokens for word, tokens in spelt.items() if tokens[:size] == self._begun}
+            for word, tokens in live.items():
+                if len(tokens) > size:
+                    self._next.setdefault(tokens[size], (None, {}))[1][word] = tokens
+            ended = next((word for word, tokens in live.items() if len(tokens) == size), None)
+            for word, tokens in ({} if ended is None else self._options([*self.words, ended])).items():
+                closed, others = self._next.setdefault(tokens[0], (ended, {}))
+                if closed is not None:
+                    others[word] = tokens
+        return self._next
+
+    def _take(self, token: int) -> None:
+        closed, live = self._following()[token]
+        if closed is not None:
+            self._close(closed)
         self._begun.append(token)
-        live = {word: spelling for word, spelling in live.items() if spelling[: size + 1] == self._begun}
-        if len(live) == 1 and len(next(iter(live.values()))) == size + 1:
+        if len(live) == 1 and next(iter(live.values())) == self._begun:
             self._close(next(iter(live)))
-        return token
+        self._next = None
 
     def _options(self, words: Sequence[str]) -> dict[str, list[int]]:
         """Spelling of every word that may follow."""
@@ -283,4 +318,5 @@ class _Answer:
             return False
         self._forbidden.setdefault(tuple(self.words[:place]), set()).add(self.words[place])
         del self.words[place:], self._tokens[place:], self._margins[place:]
+        self._next = None
         return True

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from peft import PeftModel
 
 from configs.compose import compose
 from configs.schema.eval import EvalConfig, PlannerConfig
@@ -69,6 +70,7 @@ def test_it_plans_with_the_parts_of_its_name(name: str, first: Observation) -> N
     planner = make_planner(PlannerConfig("m", "mllm", "M", str(WEIGHTS / name)))
     assert isinstance(planner, MllmPlanner | WordsPlanner)
     cfg = planner.model.cfg
+    assert isinstance(planner, MllmPlanner) or not isinstance(planner.model.vlm, PeftModel), "its adapter is folded in"
     assert cfg.episodes == cfg.sees == (name in ("base", "full"))
     assert (cfg.mpe.mode, cfg.cse.enabled, cfg.proprioception) == PARTS[name]
     planner.reset(TaskInfo(first.instruction, first.robot, first.time_limit), np.random.default_rng(0))

@@ -170,7 +170,7 @@ def test_token_after_token_is_read_as_all_at_once(seeing: WordsPlanner) -> None:
         whole = model.following(collate(examples(count), padding="left"), DynamicCache())
         torch.testing.assert_close(model.following(batch, cache), whole, atol=1e-5, rtol=1e-4)
         if count < 3:
-            batch = batch.then(torch.tensor([answer[count] for answer in words]))
+            batch = batch.then(torch.tensor([[answer[count]] for answer in words]))
 
 
 def test_what_has_been_read_is_not_read_again(planner: WordsPlanner) -> None:
@@ -236,8 +236,8 @@ def test_names_that_end_like_plurals_are_written_as_they_are_read(planner: Words
     answer = _Answer(AnswerGrammar(shown.known_objects), state, turn_example(planner.model, state.log, now, None))
     written: list[int] = []
     expected = state.words.tokens(wanted)
-    while (token := answer.choose(torch.eye(len(known))[expected[min(len(written), len(expected) - 1)]], 0.0)) is not None:
-        written.append(token)
+    while not answer.ended:
+        written += answer.choose(torch.eye(len(known))[expected[len(written)]], 0.0)
     assert written == expected == answer.begun()
     assert answer.step() == PlanStep.parse("GoTo(Zubos_1)")
 
@@ -251,8 +251,9 @@ def test_a_name_that_begins_as_another_does_is_spelt_to_its_end(spelling: WordsP
         expected, written = state.words.tokens(words), list[int]()
         assert len(expected) > len(words)
         scores = torch.eye(len(spelling.model.processor.tokenizer))
-        while (token := answer.choose(scores[expected[min(len(written), len(expected) - 1)]], 0.0)) is not None:
-            written.append(token)
+        while not answer.ended:
+            written += answer.choose(scores[expected[len(written)]], 0.0)
+            written += answer.skip()
         assert written == expected == answer.begun()
         assert tuple(answer.words) == words
         assert answer.step() == PlanStep.parse(f"GoTo({wanted})")
@@ -290,3 +291,18 @@ def test_a_stored_model_is_known_by_its_configuration(planner: WordsPlanner, tmp
     torch.testing.assert_close(loaded.model.table, planner.model.table)
     with pytest.raises(WeightsError, match=r"python train\.py stage=words"):
         WordsPlanner.load(tmp_path / "nothing", train="python train.py stage=words")
+
+
+def test_what_leaves_no_choice_is_not_asked_for(planner: WordsPlanner, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    following = planner.model.following
+    monkeypatch.setattr(planner.model, "following", lambda *args: asked.append(1) or following(*args))
+    shown = dataclasses.replace(WordsOnly(5).shown(), known_objects=("Mug_1",), visible_objects=("Mug_1",))
+    state, log = begin(planner), begin(planner)
+    log.look(shown)
+    grammar = AnswerGrammar(shown.known_objects, log.sightings.belief)
+    reply = planner.step_batch([shown], [state])[0]
+    assert reply.step is not None
+    action = reply.step.actions[0]
+    words = answer_words(action.name, action.object_id, reply.step)
+    assert len(asked) == sum(len(grammar.allowed(words[:size])) > 1 for size in range(len(words))) < len(words)
