@@ -11,6 +11,10 @@ With S the success of an episode (0 or 1), l the length of the base's path in th
 * regret: success of the same planner in the same episodes at `easy` minus success here; and mean own steps minus the expert's
   over episodes that both solved at this difficulty with this luck.
 
+* first tries: the first time in an episode that a verb is tried at a target with an arm, or with both, and not refused by what
+  the hands and the target are. It is in reach unless its code is `TooFar` (wrong by stance), `BodyTooHigh` or `BodyTooLow` (by
+  height); by arm, when the other arm then reaches the target before the robot has moved.
+
 Paper: path-length weighting after Anderson et al. 2018; none of these is in the paper.
 """
 
@@ -18,17 +22,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
+from data.interface.actions import ActionKind
 from data.interface.episode import EpisodeRecord, Outcome
+from data.interface.failures import FailureCode
 from data.interface.steps import Action, ActionError
 from proprio_mllm.report.statistics import cluster_bootstrap
 
-__all__ = ["Certificate", "Extras", "References", "extras_of", "path_efficiency", "recoveries"]
+__all__ = ["Certificate", "Extras", "References", "extras_of", "first_tries", "path_efficiency", "recoveries"]
 
 SHORTEST_M: Final = 0.1
+Reach = Literal["reached", "stance", "height", "arm"]
+_OUT_OF_REACH: Final[Mapping[str, Reach]] = {
+    FailureCode.TOO_FAR: "stance",
+    FailureCode.BODY_TOO_HIGH: "height",
+    FailureCode.BODY_TOO_LOW: "height",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +80,9 @@ class Extras:
         regret: over those.
         regret_steps_episodes: episodes that both this planner and the expert solved.
         regret_steps: over those.
+        first_tries: how many.
+        first_try_rate: share of them in reach.
+        wrong_stance, wrong_height, wrong_arm: shares of them that are not, by what was wrong; the four add up to 1.
     """
 
     certified: int
@@ -82,6 +97,11 @@ class Extras:
     regret: float
     regret_steps_episodes: int
     regret_steps: float
+    first_tries: int
+    first_try_rate: float
+    wrong_stance: float
+    wrong_height: float
+    wrong_arm: float
 
 
 def path_efficiency(own_m: float, shortest_m: float) -> float:
@@ -102,16 +122,58 @@ def recoveries(trace: Sequence[Mapping[str, Any]]) -> list[bool]:
     found: list[bool] = []
     for step in reversed(trace):
         for outcome in reversed(step["outcomes"]):
-            try:
-                action = Action.parse(outcome["action"])
-            except ActionError:
-                continue  # a reply outside the grammar, today's or that of the ledger's time
+            action = _parsed(outcome)
+            if action is None:
+                continue
             key = (action.name, action.object_id)
             if outcome["contingency"] not in ("", "success"):
                 found.append(key in done)
             if outcome["ok"]:
                 done.add(key)
     return found[::-1]
+
+
+def first_tries(trace: Sequence[Mapping[str, Any]]) -> list[Reach]:
+    """What came of each first try of an episode, in order; see the module."""
+    done = [(outcome, action) for step in trace for outcome in step["outcomes"] if (action := _parsed(outcome)) is not None]
+    tried: set[tuple[str, str | None]] = set()
+    found: list[Reach] = []
+    for number, (outcome, action) in enumerate(done):
+        reach, key = _reach(outcome, action), (action.name, action.object_id)
+        if reach is None or key in tried:
+            continue
+        tried.add(key)
+        if reach != "reached" and _other_arm_reaches(done[number + 1 :], action):
+            reach = "arm"
+        found.append(reach)
+    return found
+
+
+def _parsed(outcome: Mapping[str, Any]) -> Action | None:
+    """The action; None for a reply outside the grammar, today's or that of the ledger's time."""
+    try:
+        return Action.parse(outcome["action"])
+    except ActionError:
+        return None
+
+
+def _reach(outcome: Mapping[str, Any], action: Action) -> Reach | None:
+    """Whether an action came as far as its target; None when it aims at none, or was refused before."""
+    if action.object_id is None or not action.spec.arms:
+        return None
+    if outcome["code"] in _OUT_OF_REACH:
+        return _OUT_OF_REACH[outcome["code"]]
+    return "reached" if outcome["ok"] or outcome["code"] in action.spec.meets else None
+
+
+def _other_arm_reaches(later: Sequence[tuple[Mapping[str, Any], Action]], action: Action) -> bool:
+    """Whether the other arm reaches the target of an action before the robot moves."""
+    for outcome, after in later:
+        if after.spec.kind is ActionKind.BODY and outcome["ok"]:
+            return False
+        if (after.name, after.object_id) == (action.name, action.object_id) and after.arm is not action.arm:
+            return _reach(outcome, after) == "reached"
+    return False
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -145,6 +207,8 @@ def extras_of(records: Sequence[EpisodeRecord], references: References) -> Extra
     at_easy = [float(easy[key]) - float(success) for key, success in won.items() if key in easy]
     solved = [record for record in records if won[record.task, record.trial]]
     to_expert = [r.steps - expert[r.task, r.trial] for r in solved if (r.task, r.trial) in expert]
+    tries = [reach for record in records for reach in first_tries(record.trace)]
+    share = {name: _mean([float(one == name) for one in tries]) for name in get_args(Reach)}
     return Extras(
         certified=len(certified),
         spl=spl,
@@ -158,4 +222,9 @@ def extras_of(records: Sequence[EpisodeRecord], references: References) -> Extra
         regret=_mean(at_easy),
         regret_steps_episodes=len(to_expert),
         regret_steps=_mean(to_expert),
+        first_tries=len(tries),
+        first_try_rate=share["reached"],
+        wrong_stance=share["stance"],
+        wrong_height=share["height"],
+        wrong_arm=share["arm"],
     )

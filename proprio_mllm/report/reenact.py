@@ -67,7 +67,12 @@ class RunTasks:
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self.cfg = build(EvalConfig, run.metadata["config"], f"{run.folder}/run.json: config")
+        config = dict(run.metadata["config"])
+        # options that a planner had then and has no more say nothing about its tasks
+        config["planner"] = {
+            name: value for name, value in config["planner"].items() if name in PlannerConfig.__dataclass_fields__
+        }
+        self.cfg = build(EvalConfig, config, f"{run.folder}/run.json: config")
         # The whole file: which tasks come first may have changed since, which task is meant has not.
         everything = dataclasses.replace(self.cfg, category="all", limit=None, trials=1)
         jobs = plan_episodes(everything, select_tasks(everything), run.metadata["config_hash"])

@@ -1,7 +1,7 @@
 """One episode as a strip of pictures: `python -m proprio_mllm report strip RUN TASK [trial=0] [out=FILE.png]`.
 
 The episode is acted out again from its trace, with its own luck, so no planner is needed; a step whose result differs from the
-ledger's is marked. Columns are plan steps: the head view, a view from behind the robot, the plan text and the failure codes.
+ledger's is marked. Columns are plan steps: the head view, a view from its side, the plan text and the failure codes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Frame:
     failed: bool
 
 
-def replay(run: Run, task: str, trial: int = 0, size: int = 320, camera: str = "behind") -> list[Frame]:
+def replay(run: Run, task: str, trial: int = 0, size: int = 320, camera: str = "left") -> list[Frame]:
     """Acts an episode out again.
 
     Args:
@@ -57,7 +57,7 @@ def replay(run: Run, task: str, trial: int = 0, size: int = 320, camera: str = "
     world = reenactment.session.world
     frames: list[Frame] = []
     for moment in reenactment.moments():
-        views = [world.cameras.render(name, size, size).rgb for name in ("head", camera)]
+        views = [world.cameras.render(name, size, size, pretty=name == camera).rgb for name in ("head", camera)]
         words = " ".join(code or "ok" for code in moment.codes) + (" (differs from the ledger)" if moment.differs else "")
         if moment.differs:
             logger.warning("%s: %s gave %s, the ledger says %s", task, moment.text, moment.codes, moment.expected)
@@ -101,7 +101,7 @@ class StripConfig:
     """
 
     trial: int = 0
-    camera: str = "behind"
+    camera: str = "left"
     out: str = ""
 
 

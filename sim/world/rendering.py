@@ -20,6 +20,7 @@ from sim.gl import RenderingError
 from sim.scene.catalogue import load_catalogue
 from sim.scene.surfaces import FLOOR, PLASTER, SURFACES
 from sim.world.canvas import shared_canvas
+from sim.world.decor import wall_decor
 from sim.world.poses import ObjectPoses
 from sim.world.scene_state import SceneState
 from sim.world.servos import Servos
@@ -48,8 +49,6 @@ _MAX_GEOMS: Final = 1500
 _SAMPLES: Final = 8
 _HEADLIGHT, _FILL = 0.75, 0.5
 _LAMP, _LAMP_ABOVE_M = 0.5, 1.0
-#: Height and thickness of skirting boards.
-_SKIRTING_M: Final = (0.09, 0.012)
 #: Greys of black robots: brighter ones are left alone; parts with a larger radius are shells.
 _BLACK, _SHELL, _JOINT, _SHELL_M = 0.25, 0.68, 0.3, 0.14
 #: A camera of the room that stands in for one that is put somewhere for a picture.
@@ -165,8 +164,8 @@ class Renderer:
         scene: what is drawn; it may advance between calls.
         height: rows, at most 1280.
         width: columns, at most 1280.
-        pretty: a lamp at the ceiling that casts shadows, surfaces of wood, fabric and plaster, skirting boards, and smooth
-            edges, for people; planners get plain pictures.
+        pretty: a lamp at the ceiling that casts shadows, surfaces of wood, fabric and plaster, skirting boards, windows,
+            and smooth edges, for people; planners get plain pictures.
 
     Raises:
         ValueError: on a size outside 1..1280.
@@ -189,6 +188,7 @@ class Renderer:
             self._drawn.flags[int(flag)] = int(pretty)
         self._shades = greys(scene) if pretty else {}
         self._surfaces = surfaces(scene.model) if pretty else {}
+        self._decor = wall_decor(scene) if pretty else []
         self._planes = np.flatnonzero(scene.model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))
         robot = np.isin(scene.model.geom_bodyid, list(scene.robot_bodies))
         labels = np.where(robot, _ROBOT, scene.object_of_geom).astype(np.int32)
@@ -234,23 +234,21 @@ class Renderer:
         groups[:], scene.model.geom_matid[:] = kept, plain
         scene.data.cam_xpos[index] = place
         if self._pretty:
-            self._add_skirting(set(outside.tolist()))
+            self._add_decor(set(outside.tolist()))
             self._light()
         return pose
 
-    def _add_skirting(self, outside: set[int]) -> None:
-        """A board along the foot of each wall that is seen."""
-        model, data = self._scene.model, self._scene.data
-        for wall in self._planes:
-            if not model.geom(int(wall)).name.startswith("wall_") or int(wall) in outside:
+    def _add_decor(self, outside: set[int]) -> None:
+        """What hangs on the walls that are seen."""
+        data = self._scene.data
+        for one in self._decor:
+            if one.wall in outside or self._drawn.ngeom == _MAX_GEOMS:
                 continue
-            half, turn = model.geom_size[wall], data.geom_xmat[wall].reshape(3, 3)
-            foot = data.geom_xpos[wall] - turn[:, 1] * (half[1] - _SKIRTING_M[0] / 2.0)
+            place = data.geom_xpos[one.wall] + data.geom_xmat[one.wall].reshape(3, 3) @ one.centre
             board = self._drawn.geoms[self._drawn.ngeom]
             self._drawn.ngeom += 1
-            size = np.array([half[0], _SKIRTING_M[0] / 2.0, _SKIRTING_M[1]])
-            colour = np.array([0.92, 0.92, 0.90, 1.0], dtype=np.float32)
-            mujoco.mjv_initGeom(board, int(mujoco.mjtGeom.mjGEOM_BOX), size, foot, data.geom_xmat[wall], colour)
+            colour = np.array(one.rgba, dtype=np.float32)
+            mujoco.mjv_initGeom(board, int(mujoco.mjtGeom.mjGEOM_BOX), one.size, place, data.geom_xmat[one.wall], colour)
             board.segid = -1
 
     def _light(self) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from data.interface.episode import Outcome
 from proprio_mllm.evaluation.run import task_key
-from proprio_mllm.report.metrics import Certificate, References, extras_of, path_efficiency, recoveries
+from proprio_mllm.report.metrics import Certificate, References, extras_of, first_tries, path_efficiency, recoveries
 from proprio_mllm.report.references import read_certificates, references_of
 from proprio_mllm.report.runs import load_run, write_report
 from sim.tasks.task import load_benchmark
@@ -69,6 +69,41 @@ INVALID = ("", False, "")
 )
 def test_recoveries(trace, expected) -> None:
     assert recoveries(trace) == expected
+
+
+def coded(*outcomes: tuple[str, str]) -> dict:
+    return {"outcomes": [{"action": a, "ok": not code, "code": code, "contingency": ""} for a, code in outcomes]}
+
+
+LEFT, RIGHT, WALK = ("Pick(left, Mug_1)", ""), ("Pick(right, Mug_1)", ""), ("MoveAhead(0.5)", "")
+FAR, HIGH = ("Pick(left, Mug_1)", "TooFar"), ("Pick(left, Mug_1)", "BodyTooHigh")
+
+
+@pytest.mark.parametrize(
+    ("trace", "expected"),
+    [
+        ([coded(LEFT)], ["reached"]),
+        ([coded(("Pick(left, Mug_1)", "GraspMissed"))], ["reached"]),  # the hand came to it
+        ([coded(("Pick(left, Mug_1)", "HandOccupied")), coded(LEFT)], ["reached"]),  # refused before anything was tried
+        ([coded(HIGH), coded(LEFT)], ["height"]),  # only the first try counts
+        ([coded(FAR), coded(WALK), coded(RIGHT)], ["stance"]),
+        ([coded(FAR), coded(RIGHT)], ["arm"]),
+        ([coded(FAR), coded(("MoveAhead(1)", "BlockedPath")), coded(RIGHT)], ["arm"]),
+        ([coded(FAR), coded(("Pick(right, Mug_1)", "TooFar")), coded(LEFT)], ["stance"]),
+        ([coded(("Lift(Box_1)", "BodyTooLow")), coded(("Lift(Box_1)", ""))], ["height"]),
+        ([coded(LEFT, ("Open(right, Fridge_1)", "")), coded(("Place(left, Fridge_1)", ""))], ["reached"] * 3),
+        ([coded(WALK, ("fly!", "InvalidOutput")), coded(("GoTo(Mug_1)", "")), coded(("Release(left)", ""))], []),
+    ],
+)
+def test_first_tries(trace, expected) -> None:
+    assert first_tries(trace) == expected
+
+
+def test_first_tries_are_shared_out(record) -> None:
+    traces = [(coded(LEFT),), (coded(FAR),), (coded(HIGH), coded(LEFT)), (coded(FAR), coded(RIGHT)), (coded(WALK),)]
+    extras = extras_of([record(str(n), "single", True, trace=trace) for n, trace in enumerate(traces)], References())
+    assert extras.first_tries == 4
+    assert extras.first_try_rate == extras.wrong_stance == extras.wrong_height == extras.wrong_arm == pytest.approx(0.25)
 
 
 def test_recovery_counts_events_and_their_episodes(record) -> None:

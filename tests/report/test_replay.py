@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -34,3 +36,14 @@ def test_steps_come_when_they_are_asked_for(
 def test_wrong_arguments(acted_run: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([argument.format(run=acted_run) for argument in arguments]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_an_option_that_planners_have_no_more_does_not_matter(
+    acted_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = shutil.copytree(acted_run, tmp_path / "run")
+    meta = json.loads((run / "run.json").read_text())
+    meta["config"]["planner"]["gone"] = 48
+    (run / "run.json").write_text(json.dumps(meta))
+    monkeypatch.setattr("sys.stdin", io.StringIO("c\n"))
+    assert main([str(run), "plant", "speed=1000"]) == 0

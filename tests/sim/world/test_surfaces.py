@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 
 from sim.robots.spec import load_robot
 from sim.scene.rooms import room_names
+from sim.world.decor import wall_decor
 from sim.world.rendering import surfaces
 from sim.world.world import World
 
@@ -44,9 +46,29 @@ def test_floors_are_of_the_rooms_colours() -> None:
     assert planks.mean(0) == pytest.approx([0.60, 0.44, 0.30], abs=0.08) and planks.std() > 0.1
 
 
-def test_skirting_is_no_object() -> None:
+def test_what_hangs_on_walls_is_no_object() -> None:
     world = World(None, "bathroom_1")
     pretty = world.cameras.render("overview", 240, 320, segmentation=True, pretty=True)
     plain = world.cameras.render("overview", 240, 320, segmentation=True)
     assert pretty.segmentation is not None and plain.segmentation is not None
     assert np.array_equal(pretty.segmentation, plain.segmentation)
+
+
+@pytest.mark.parametrize("room", room_names())
+def test_windows_are_where_no_furniture_is(room: str) -> None:
+    world = World(None, room)
+    model, data = world.model, world.data
+    boards = wall_decor(world.scene)
+    skirting = [one for one in boards if one.centre[1] < -model.geom_size[one.wall, 1] + 0.1]
+    glass = [one for one in boards if one.rgba[2] > one.rgba[0] + 0.1]
+    assert len({one.wall for one in skirting}) == len(skirting) == 4
+    assert 1 <= len(glass) <= 2 and len(boards) == 4 + 8 * len(glass)
+    for one in glass:
+        axes = data.geom_xmat[one.wall].reshape(3, 3)
+        middle = data.geom_xpos[one.wall] + axes @ one.centre
+        for corner in np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)]) * one.size[:2]:
+            hit = np.zeros(1, dtype=np.int32)
+            start = middle + axes @ (*corner, 0.65)
+            mujoco.mj_ray(model, data, start, -axes[:, 2], np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8), 1, -1, hit)
+            fixed = int(model.body_weldid[model.geom_bodyid[hit[0]]]) == 0
+            assert hit[0] == one.wall or not fixed, model.geom(int(hit[0])).name
