@@ -29,6 +29,8 @@ DifficultyName = Literal["easy", "medium", "hard", "natural"]
 SplitName = Literal["all", "seen", "unseen"]
 SchedulerName = Literal["local", "ray"]
 StartName = Literal["fixed", "turned", "random"]
+BlindName = Literal["none", "image", "motion", "both"]
+FeedbackName = Literal["codes", "bit"]
 PlannerKind = Literal["mllm", "file", "random", "scripted", "expert", "plain", "llm_planner", "rap", "dag_plan"]
 #: Kinds that ask a language model in chats, and so need a backend.
 CHAT_KINDS: Final[tuple[PlannerKind, ...]] = ("plain", "llm_planner", "rap", "dag_plan")
@@ -38,6 +40,7 @@ _OF_KINDS: Final[Mapping[str, tuple[PlannerKind, ...]]] = {
     "temperature": ("mllm",),
     "max_new_tokens": ("mllm",),
     "insist": ("mllm",),
+    "blind": ("mllm", *CHAT_KINDS, "file"),
     "replans": (*CHAT_KINDS, "file"),
     "history": (*CHAT_KINDS, "file"),
     "body": (*CHAT_KINDS, "file"),
@@ -67,6 +70,7 @@ class PlannerConfig:
         insist: whether a model that plans from whole episodes may take steps that are bound to be refused by what its log tells
             of hands and states, look for something where it has been, end the task with a step that did nothing, and take a
             third time what was refused twice.
+        blind: hides the picture, the robot's own body, or both (`proprio_mllm.evaluation.showing`).
         image_size: side of the head view in pixels for `random`, `scripted` and `expert`, 0 for none; others bring their own,
             or have `backend.image_size`.
         reflection: `on` reflects on failures. Planners of a backend ask once more for cause, change and new steps; a stored
@@ -90,6 +94,7 @@ class PlannerConfig:
     temperature: float = 0.0
     max_new_tokens: int = 48
     insist: bool = False
+    blind: BlindName = "none"
     image_size: int = 112
     reflection: Literal["on", "off"] = "on"
     replans: int = 5
@@ -164,6 +169,7 @@ class EvalConfig:
         seed: of the luck, hashed with task, robot and trial.
         tasks: `benchmark`, or the path of a JSON-lines file of tasks.
         limit: only the first so many tasks of each category.
+        feedback: `codes` tells planners why an action failed, `bit` only that it did.
         retries: how often an episode with an infrastructure error is run again.
         output: folder of all outputs.
         experiment: assemble this instead of running episodes.
@@ -193,6 +199,7 @@ class EvalConfig:
     seed: int = 0
     tasks: str = "benchmark"
     limit: int | None = None
+    feedback: FeedbackName = "codes"
     retries: int = 1
     output: str = "outputs"
     experiment: ExperimentConfig | None = None

@@ -12,6 +12,7 @@ pretrained backbone reads feedback in plain words already.
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import functools
 import os
@@ -26,11 +27,12 @@ from tqdm import tqdm
 from configs.schema.collect import CollectConfig
 from data.interface.actions import ACTIONS, ActionKind
 from data.interface.bodies import PAPER_ROBOTS, Arm
-from data.interface.observation import Observation
+from data.interface.observation import HistoryItem, Observation
 from data.interface.steps import Action, PlanStep
 from data.shards import Manifest, ShardWriter, config_hash
 from data.workers import worker_pool
 from proprio_mllm.planners.protocol import TaskInfo
+from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 from proprio_mllm.training.rollouts import DaggerRequest
 
 __all__ = ["collect_dagger", "collect_lessons"]
@@ -74,7 +76,7 @@ def collect_lessons(
         overwrite: start over when the folder holds something else.
     """
     keyed = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "workers")}
-    keyed["version"] = 1
+    keyed["version"] = 2
     report = progress or (lambda done, parts: None)
     return _write(config, config_hash(keyed), functools.partial(_lessons, config), {"config": keyed}, report, overwrite)
 
@@ -103,25 +105,28 @@ def _lessons(config: CollectConfig, part: int, student: str | None = None) -> li
     os.environ.setdefault("MUJOCO_GL", "egl")
     from sim.collection.demonstrations import lessons_of_part
 
-    return list(lessons_of_part(config, part, _rules(), None if student is None else _in_words(student)))
+    return list(lessons_of_part(config, part, _Rules(), None if student is None else _in_words(student)))
 
 
-def _rules() -> Callable[[Observation], tuple[PlanStep, Action | None] | None]:
-    """The scripted planner as a teacher of `sim.collection.demonstrations`."""
-    from proprio_mllm.planners.scripted.planner import ScriptedPlanner
+class _Rules:
+    """The scripted planner as a `Teacher` of `sim.collection.demonstrations`."""
 
-    planner = ScriptedPlanner()
+    def __init__(self) -> None:
+        self._planner = ScriptedPlanner()
 
-    def answer(observation: Observation) -> tuple[PlanStep, Action | None] | None:
+    def __call__(self, observation: Observation) -> tuple[PlanStep, Action | None] | None:
         if not observation.history:
-            planner.reset(_task(observation), np.random.default_rng(0))
-        step, job = planner.decide(observation)
+            self._planner.reset(_task(observation), np.random.default_rng(0))
+        step, job = self._planner.decide(observation)
         if job is None:
             return None
         arm = job.arm or (Arm.RIGHT if ACTIONS[job.verb].kind is ActionKind.ARM else None)
         return step, job.action(arm) if job.target else None
 
-    return answer
+    def after(self, observation: Observation, refused: HistoryItem) -> PlanStep | None:
+        later = dataclasses.replace(observation, history=(*observation.history, refused))
+        step, job = copy.deepcopy(self._planner).decide(later)
+        return None if job is None else step
 
 
 def _in_words(model: str) -> Callable[[Observation], PlanStep | None]:

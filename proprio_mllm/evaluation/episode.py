@@ -29,6 +29,7 @@ from data.interface.observation import HistoryItem, Observation
 from data.interface.steps import PlanStep
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, attribute
 from proprio_mllm.evaluation.seeds import stream
+from proprio_mllm.evaluation.showing import Showing
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo, Usage
 
 __all__ = [
@@ -50,6 +51,7 @@ logger = logging.getLogger(__name__)
 
 #: A robot that is not farther from where it was, in metres and radians, has not moved.
 _MOVED: Final = 0.02
+_EVERYTHING: Final = Showing()
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,13 +170,14 @@ def run_episode(
     limits: Limits,
     episode_seed: int,
     watch: Watcher | None = None,
+    showing: Showing = _EVERYTHING,
 ) -> EpisodeRecord:
     """Runs an episode to its end with a planner of its own; see `episode_steps` for the arguments.
 
     Returns:
         The record; on any exception one with the outcome `INFRASTRUCTURE_ERROR` and the error's text.
     """
-    episode = episode_steps(open_session, fields, instruction, limits, episode_seed, watch)
+    episode = episode_steps(open_session, fields, instruction, limits, episode_seed, watch, showing)
     said: PlannerReply | Exception | None = None
     try:
         while True:
@@ -201,6 +204,7 @@ def episode_steps(
     limits: Limits,
     episode_seed: int,
     watch: Watcher | None = None,
+    showing: Showing = _EVERYTHING,
 ) -> Episode:
     """An episode that pauses wherever it needs its planner, so that several can go side by side in one thread.
 
@@ -211,6 +215,7 @@ def episode_steps(
         limits: what ends it.
         episode_seed: the episode's seed (`seeds.episode_seed`), for the session and the planner's random stream.
         watch: sees every observation.
+        showing: what of it the planner sees.
 
     Yields:
         What the planner is asked. An exception thrown in becomes part of the record.
@@ -224,7 +229,7 @@ def episode_steps(
         session = open_session()
         observation = session.reset(episode_seed)
         yield Begin(TaskInfo(instruction, fields.robot, limits.time, limits.steps), stream(episode_seed, "planner"))
-        end = yield from _loop(session, observation, limits, tally, watch)
+        end = yield from _loop(session, observation, limits, tally, watch, showing)
         goals, stats = session.goals(), session.stats()
     except Exception as error:  # noqa: BLE001  # an episode must never end the run; the record tells what happened
         logger.warning("%s on %s, trial %d: %s", fields.planner, fields.task, fields.trial, error)
@@ -320,6 +325,7 @@ def _loop(
     limits: Limits,
     tally: _Tally,
     watch: Watcher | None,
+    showing: Showing,
 ) -> Generator[Ask, PlannerReply | None, Literal["goals", "done", "steps", "stuck"]]:
     """Steps until the end; returns what ended the episode."""
     history: list[HistoryItem] = []
@@ -332,7 +338,7 @@ def _loop(
         shown = _shown(observation, history, tally.charged, limits)
         if watch is not None:
             watch(shown, reply, feedback)
-        reply = yield Ask(shown, None if feedback is None else feedback.public())
+        reply = yield Ask(showing.observation(shown), showing.outcome(feedback))
         if not isinstance(reply, PlannerReply):
             raise TypeError(f"the planner's step() gave {type(reply).__name__}; allowed: PlannerReply")
         tally.add(reply)

@@ -165,19 +165,31 @@ class Lessons:
         return episode
 
     def told(self, folder: Path) -> tuple[WordEpisode, ...]:
-        """All episodes of a folder as `logged` gives them, in order and with their own names; a turn is a row."""
-        return tuple(_of_log(looks, done, {}) for looks, done in _logs(folder).values())
+        """All episodes of a folder in order and with their own names; a turn is a row, and its answer the row's target.
+
+        Sub-goals are the teacher's own; where its step could be foreseen to be out of reach, the target is another one.
+        """
+        columns = (ShardReader(folder, "demos").column(name) for name in ("episode", "target"))
+        targets: dict[str, list[PlanStep]] = {}
+        for episode, target in zip(*columns, strict=True):
+            targets.setdefault(episode, []).append(PlanStep.parse(target))
+        return tuple(_of_log(looks, done, {}, targets[name]) for name, (looks, done) in _logs(folder).items())
 
 
-def _of_log(looks: Sequence[Shown], done: bool, names: Mapping[str, str]) -> WordEpisode:
-    """The episode in which a planner was shown this, and whose goals were met at its end or not, under other names."""
+def _of_log(
+    looks: Sequence[Shown], done: bool, names: Mapping[str, str], targets: Sequence[PlanStep] | None = None
+) -> WordEpisode:
+    """The episode in which a planner was shown this, and whose goals were met at its end or not, under other names.
+
+    Its steps are `targets`, or what the teacher says to what was shown.
+    """
     teacher, record = ScriptedPlanner(), _Record(names)
-    for number, shown in enumerate(looks, 1):
+    for number, shown in enumerate(looks):
         step, job = teacher.decide(shown)
-        if done and number == len(looks):
+        if done and number + 1 == len(looks):
             record.look(shown, PlanStep((Action("Done"),)), "Done", "")
         elif job is not None:
-            record.look(shown, step, job.verb, job.target)
+            record.look(shown, step if targets is None else targets[number], job.verb, job.target)
         else:  # it gives up
             break
     return record.episode()

@@ -44,6 +44,8 @@ def options_of(config: Mapping[str, Any]) -> list[str]:
         (split, split != "all"),
         ("no_reflection", planner.get("reflection", "on") == "off"),
         ("body", planner.get("body", False)),
+        (f"blind_{planner.get('blind')}", planner.get("blind", "none") != "none"),
+        ("bit", config.get("feedback", "codes") == "bit"),
         ("one_node", not planner.get("parallel", True)),
         *_changed(planner, _published(planner), ("horizon", "replans", "history", "examples", "temperature")),
         *_changed(config.get("backend") or {}, defaults_of(BackendConfig), _ASKED),

@@ -143,8 +143,11 @@ def config_hash(cfg: EvalConfig, digest: str) -> str:
     for name in ("reflection", "replans", "horizon", "history", "body", "examples", "parallel"):
         if cfg.planner.kind not in CHAT_KINDS and planner[name] == defaults[name]:
             del planner[name]
+    if planner["blind"] == "none":
+        del planner["blind"]
     decides = {"planner": planner, "weights": digest, "robot": dataclasses.asdict(cfg.robot), "start": cfg.start}
     decides |= {"steps": cfg.steps, "stuck": cfg.stuck, "physics": PHYSICS}
+    decides |= {"feedback": cfg.feedback} if cfg.feedback != "codes" else {}
     decides["contingencies"] = _contingencies_hash(cfg)
     if cfg.backend is not None:
         own = {name: getattr(cfg.backend, name) for name in ("max_tokens", "temperature", "image_size")}
@@ -327,7 +330,7 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None, told: bool = True) -
     shared = str(folder.absolute())
     setup = WorkerSetup(
         planner, cfg.difficulty, cfg.start, cfg.contingencies, None, cfg.backend, shared, cfg.cost_cap_usd,
-        cfg.steps, cfg.stuck,
+        cfg.steps, cfg.stuck, cfg.feedback,
     )  # fmt: skip
     path = folder / "ledger.jsonl"
     with Ledger(path) as ledger:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
 from configs.schema.backend import BackendConfig
-from configs.schema.eval import DifficultyName, PlannerConfig, StartName
+from configs.schema.eval import DifficultyName, FeedbackName, PlannerConfig, StartName
 from configs.schema.robot import RobotConfig
 from data.interface.episode import STEP_LIMIT, EpisodeRecord, Outcome
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest, CostCapError, UnreachableError
@@ -31,6 +31,7 @@ from proprio_mllm.evaluation.episode import (
     answer,
     episode_steps,
 )
+from proprio_mllm.evaluation.showing import Showing
 from proprio_mllm.planners.bars import without_bar
 from proprio_mllm.planners.protocol import BatchPlanner, Planner, PlannerReply
 from proprio_mllm.planners.registry import make_chat_planner, make_planner
@@ -68,6 +69,7 @@ class WorkerSetup:
         folder: of the run, where its processes share what they may spend and how many calls go on at once.
         cap_usd: most money the run may spend.
         steps, stuck: see `EvalConfig`.
+        feedback: what planners are told of failures.
     """
 
     planner: PlannerConfig
@@ -80,6 +82,7 @@ class WorkerSetup:
     cap_usd: float | None = None
     steps: int | Literal["task"] = STEP_LIMIT
     stuck: int = 0
+    feedback: FeedbackName = "codes"
 
 
 class PlannerServer(Protocol):
@@ -220,7 +223,8 @@ class EpisodeWorker:
             opened.append(self._opener(self.setup, job, self.planner))
             return opened[-1]
 
-        episode = episode_steps(open_session, job.fields, task.instruction, limits, job.episode_seed, watch)
+        showing = Showing(self.setup.planner.blind, self.setup.feedback)
+        episode = episode_steps(open_session, job.fields, task.instruction, limits, job.episode_seed, watch, showing)
         one = _Running(job, episode, recorder, opened)
         one.go_on(None)
         return one

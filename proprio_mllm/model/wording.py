@@ -24,6 +24,7 @@ from data.interface.actions import ACTIONS, ActionKind
 from data.interface.belief import ARM_SPECIFIC, UNKNOWN, Belief
 from data.interface.bodies import Arm
 from data.interface.effects import Condition
+from data.interface.failures import FAILED
 from data.interface.observation import HistoryItem
 from data.interface.sightings import Seen, Sightings
 from data.interface.steps import Action, PlanStep
@@ -140,7 +141,7 @@ def log_words(steps: Sequence[HistoryItem], new: Sequence[str]) -> Words:
     for events in events_of(steps):
         words.append("did")
         for event in events:
-            words += [*_action_words(event.action), event.code]
+            words += [*_action_words(event.action), "fail" if event.code == FAILED else event.code]
     if new:
         words += ["see", *(word for name in new for word in id_words(name))]
     return tuple(words)

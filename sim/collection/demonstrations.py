@@ -9,21 +9,25 @@ With a student, its steps are executed in place of the expert's (DAgger, Ross et
 would do where a learned planner's own mistakes have led it. The student gets no say where it repeats a step that just failed or
 ends the episode, in a share of the steps, and after as many steps as the task allows; the expert then finishes the episode.
 
-Lessons are episodes with another teacher, a function of what a planner sees, at the controls: right steps, mistakes and a
-student's steps, each kept with the teacher's answer whether the goals are met in the end or not.
+Lessons are episodes with another teacher, a function of what a planner reads, at the controls: right steps, mistakes and a
+student's steps, each kept with the teacher's answer whether the goals are met in the end or not. What that teacher cannot read
+before its first try, how high, how far and which arm, the simulator's reach test foresees (`foreseen`): such an answer is one
+for planners that see and feel.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from configs.schema.collect import CollectConfig
 from data.interface.actions import ActionKind
+from data.interface.failures import FailureCode
 from data.interface.observation import HistoryItem, Observation
 from data.interface.steps import Action, PlanStep
 from data.shards import encode_png
@@ -41,6 +45,7 @@ __all__ = [
     "accepted",
     "demos_of_part",
     "draw_family",
+    "foreseen",
     "lessons_of_part",
     "perturbed",
     "run_episode",
@@ -51,9 +56,19 @@ __all__ = [
 Play = Callable[[CollectConfig, int, dict[tuple[str, str], Session]], "Episode"]
 #: A planner that learns: the step it would take, None when its reply is no step.
 Student = Callable[[Observation], PlanStep | None]
-#: The step that should be taken and the action that it works towards; None where the teacher gives up. It is shown an episode's
-#: observations one after the other.
-Teacher = Callable[[Observation], tuple[PlanStep, Action | None] | None]
+
+
+class Teacher(Protocol):
+    """Names the step that should be taken; it is shown an episode's observations one after the other."""
+
+    def __call__(self, observation: Observation) -> tuple[PlanStep, Action | None] | None:
+        """The step, and the action that it works towards; None where the teacher gives up."""
+        ...
+
+    def after(self, observation: Observation, refused: HistoryItem) -> PlanStep | None:
+        """The step that would follow if the one just named had been refused; None where the teacher would give up."""
+        ...
+
 
 #: Training seeds of one collection seed; two collections do not share tasks.
 _SEEDS_PER_COLLECTION: Final = 1_000_000
@@ -66,6 +81,9 @@ _LESSONS_FROM: Final = 700_000
 _PRACTICE_FROM: Final = 800_000
 _LESSON_STEPS: Final = 32
 MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
+#: Steps in a row that are foreseen before one is tried all the same, and heights in words.
+_MOST_FORESEEN: Final = 3
+_HEIGHT_M: Final = 0.05
 #: How often a drawn family is of each category. Two things for two arms are learnt last.
 _CATEGORY_SHARES: Final = (0.2, 0.5, 0.3)
 
@@ -173,13 +191,17 @@ def run_lesson(
     robot, task, session, observation = _start(config, number, rng, sessions, family=family)
     session.step_limit = _LESSON_STEPS
     mistakes = float(rng.choice(MISTAKES))
-    episode = Episode()
+    episode, corrected = Episode(), 0
     done = PlanStep((Action("Done"),))
     while not session.finished:
         answer = teacher(observation)
         if answer is None:
             break
         target, intent = answer
+        taught = target.to_text()
+        better = foreseen(session, observation, target, teacher) if corrected < _MOST_FORESEEN else None
+        corrected = 0 if better is None else corrected + 1
+        target = better or target
         step, origin = target, "teacher"
         if student is None and rng.random() < mistakes:
             step, origin = perturbed(target, observation, rng, intent)
@@ -188,14 +210,50 @@ def run_lesson(
             proposed = accepted(own, observation.history[-1] if observation.history else None)
             if proposed is not None and rng.random() >= config.noise:
                 step, origin = proposed, "student"
-        executed = {"executed": step.to_text(), "origin": origin}
+        executed = {"executed": step.to_text(), "origin": origin, "taught": taught}
         episode.rows.append(_row(observation, task, robot, number, target, executed))
         observation, _ = session.step(step)
     episode.success, episode.steps = session.succeeded, len(episode.rows)
     if episode.success:
-        nothing = {"executed": done.to_text(), "origin": "teacher"}
+        nothing = {"executed": done.to_text(), "origin": "teacher", "taught": done.to_text()}
         episode.rows.append(_row(observation, task, robot, number, done, nothing))
     return episode
+
+
+def foreseen(session: Session, observation: Observation, step: PlanStep, teacher: Teacher) -> PlanStep | None:
+    """What should be done before a step that an arm cannot reach for, or in its place; None where it can be tried.
+
+    Args:
+        session: knows the reach of the arms.
+        observation: what the teacher saw.
+        step: its answer.
+        teacher: tells where it would go if it were refused.
+    """
+    for action in step.actions:
+        refusal = session.assess(action) if action.spec.arms and action.object_id is not None else None
+        if refusal is None:
+            continue
+        if refusal.code in (FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW):
+            return _at_height(session, action, float(refusal.margins["height_m"]))
+        if refusal.code == FailureCode.TOO_FAR:
+            other = None if action.arm is None else replace(action, arm=action.arm.other)
+            if other is not None and len(step.actions) == 1 and session.assess(other, diagnose=False) is None:
+                return PlanStep((other,))
+            codes = "; ".join(f"{one.to_text()} {refusal.code if one is action else 'ok'}" for one in step.actions)
+            return teacher.after(observation, HistoryItem(step.to_text(), codes))
+    return None
+
+
+def _at_height(session: Session, action: Action, change_m: float) -> PlanStep | None:
+    """A change of height, in steps of words, from which an action can be tried."""
+    name, present = "MoveUp" if change_m > 0 else "MoveDown", session.body.posture.pelvis_height_m
+    low = math.floor(abs(change_m) / _HEIGHT_M + 1e-6)
+    for count in (low + 1, low, low + 2):
+        amount = round(count * _HEIGHT_M, 2)
+        there = present + math.copysign(amount, change_m)
+        if count and session.assess(action, diagnose=False, pelvis_height_m=there) is None:
+            return PlanStep((Action(name, amount=amount),))
+    return None
 
 
 def draw_family(rng: np.random.Generator) -> str:

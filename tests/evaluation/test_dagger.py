@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 import torch
 
+from configs.schema.collect import CollectConfig
 from data.interface.observation import Observation
 from data.interface.steps import PlanStep
 from data.shards import ShardReader
 from proprio_mllm.evaluation import dagger
 from proprio_mllm.evaluation.dagger import collect_dagger
 from proprio_mllm.training.rollouts import DaggerRequest
+from sim.collection.demonstrations import run_lesson
 
 
 @pytest.fixture
@@ -62,3 +65,12 @@ def test_training_keeps_its_threads(request_: DaggerRequest, monkeypatch: pytest
         assert (set(seen), torch.get_num_threads()) == ({1}, 2)
     finally:
         torch.set_num_threads(threads)
+
+
+def test_lessons_try_what_is_out_of_reach_less_often() -> None:
+    config, tries = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, medium_share=0.0), []
+    for index in range(4):
+        episode = run_lesson(config, index, None, dagger._Rules())
+        tries += [item["feedback"].rpartition(" ")[2] for item in episode.rows[-1]["history"]]
+        tries += ["changed" for row in episode.rows if row["target"] != json.loads(row["privileged"])["taught"]]
+    assert tries.count("changed") > sum(tries.count(code) for code in ("BodyTooHigh", "BodyTooLow", "TooFar"))

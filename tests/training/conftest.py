@@ -248,7 +248,7 @@ def correct(request: DaggerRequest, workers: int) -> None:
     for number in range(12):
         row = dict(source[number])
         executed = row["target"] if number % 2 else "MoveAhead(0.5)"
-        note = {"executed": executed, "origin": "student" if number < 8 else "teacher"}
+        note = {"executed": executed, "origin": "student" if number < 8 else "teacher", "taught": row["target"]}
         rows.append({**row, "episode": f"corrected{number // 4}", "privileged": json.dumps(note)})
     writer = ShardWriter(request.folder, "demos", request.config_hash, overwrite=True)
     writer.write(0, rows)

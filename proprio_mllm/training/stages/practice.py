@@ -45,7 +45,9 @@ class PracticeStage:
         shards = pipeline.paths.shards("practice")
         if pipeline.cfg.overwrite:
             shutil.rmtree(shards, ignore_errors=True)
-        written = config_hash({"key": pipeline.key("words"), "episodes": cfg.episodes, "share": cfg.teacher_share})
+        written = config_hash(
+            {"key": pipeline.key("words"), "episodes": cfg.episodes, "share": cfg.teacher_share, "version": 2}
+        )
         request = DaggerRequest(
             student,
             shards,
@@ -65,8 +67,7 @@ class PracticeStage:
         save_model(model.eval(), pipeline.paths.model("practice"))
         reader = ShardReader(shards, "demos")
         notes = [json.loads(text) for text in reader.column("privileged")]
-        acted = [note["executed"] == target for note, target in zip(notes, reader.column("target"), strict=True)]
-        mine = [same for note, same in zip(notes, acted, strict=True) if note["origin"] == "student"]
+        mine = [note["executed"] == note["taught"] for note in notes if note["origin"] == "student"]
         return {
             **held_out_metrics(model, {"": lessons.episode, "_logged": taught, "_own": own}),
             "own_steps": float(len(mine)),

@@ -9,12 +9,15 @@ from configs.arguments import read_arguments
 from configs.schema.collect import CollectConfig
 from configs.validate import ConfigError
 from data.interface.bodies import Arm
+from data.interface.observation import HistoryItem, Observation
 from data.interface.steps import Action, PlanStep
 from data.motion import N_FEATURES
 from data.shards import ShardReader, decode_depth, decode_png, decode_segmentation
 from sim.collection.collect import collect, main, parts_of, rows_of_part
-from sim.collection.demonstrations import perturbed, run_episode, run_lesson
+from sim.collection.demonstrations import foreseen, perturbed, run_episode, run_lesson
 from sim.collection.view_sampling import type_names
+from sim.session.session import Session
+from sim.tasks.task import load_benchmark
 
 VIEWS = CollectConfig("views", "unused", 6, part_size=3, views_per_world=3, image_size=56)
 
@@ -95,13 +98,29 @@ def test_an_episode_has_one_row_per_step_with_the_experts_choice():
             assert episode.rows[number + 1]["history"][-1]["step"] == executed["executed"]
 
 
+class _Turning:
+    """A teacher that always says the same; it keeps what it was shown."""
+
+    def __init__(self, step: str = "RotateLeft(10)") -> None:
+        self.step, self.shown = PlanStep.parse(step), list[Observation]()
+
+    def __call__(self, observation: Observation) -> tuple[PlanStep, Action | None] | None:
+        self.shown.append(observation)
+        return self.step, None
+
+    def after(self, observation: Observation, refused: HistoryItem) -> PlanStep | None:
+        assert refused.feedback.endswith(" TooFar") and refused.step == self.step.to_text()
+        return PlanStep((Action("MoveAhead", amount=0.3),))
+
+
+class _Silent(_Turning):
+    def __call__(self, observation: Observation) -> None:
+        return None
+
+
 def test_a_lesson_keeps_the_teachers_answer_to_every_step_and_ends_with_done():
     config = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, medium_share=0.0)
-    shown = []
-
-    def teacher(observation):
-        shown.append(observation)
-        return PlanStep((Action("RotateLeft", amount=10.0),)), None
+    teacher = _Turning()
 
     def student(observation):
         return PlanStep((Action("Place", arm=Arm.RIGHT, object_id=observation.known_objects[0]),))
@@ -110,10 +129,36 @@ def test_a_lesson_keeps_the_teachers_answer_to_every_step_and_ends_with_done():
     assert len(alone.rows) == len(taught.rows) == 32
     assert {row["target"] for row in (*alone.rows, *taught.rows)} == {"RotateLeft(10)"}
     assert [row["image"] for row in alone.rows] == [row["image"] for row in run_lesson(config, 3, None, teacher).rows]
-    assert [len(observation.history) for observation in shown[:32]] == list(range(32))
+    assert [len(observation.history) for observation in teacher.shown[:32]] == list(range(32))
     origins = [json.loads(row["privileged"])["origin"] for row in taught.rows]
     assert origins[:2] == ["student", "teacher"]  # what has just failed is not tried again
-    assert run_lesson(config, 3, None, lambda observation: None).rows == []
+    assert run_lesson(config, 3, None, _Silent()).rows == []
+
+
+@pytest.mark.parametrize("robot", ["h1", "x1"])
+def test_what_an_arm_cannot_reach_is_foreseen(robot: str) -> None:
+    session = Session(robot, image_size=0)
+    task = next(task for task in load_benchmark() if task.family == "carry" and task.room == "living_room_1")
+    name = task.placements[0].object_id
+    observation = session.reset(task, seed=0)
+    for height in (None, *session.body.spec.pelvis_height_range_m):
+        teacher = _Turning(f"Lift({name})")
+        if height is not None:
+            session.step(PlanStep((Action("GoTo", object_id=name),)))
+            stance = session.body.posture.stance()
+            session.teleport(stance.x, stance.y, stance.yaw_rad, height)
+            observation = session.observation()
+        step = foreseen(session, observation, teacher.step, teacher)
+        refusal = session.assess(teacher.step.actions[0])
+        if refusal is None:
+            assert step is None
+        elif refusal.code == "TooFar":
+            assert step == PlanStep((Action("MoveAhead", amount=0.3),))
+        elif step is not None:
+            assert step.actions[0].name == ("MoveUp" if refusal.code == "BodyTooLow" else "MoveDown")
+            _, feedback = session.step(step)
+            assert feedback.success and session.assess(teacher.step.actions[0]) is None
+    assert foreseen(session, observation, PlanStep((Action("RotateLeft", amount=10.0),)), teacher) is None
 
 
 class _Seen:
