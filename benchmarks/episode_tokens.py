@@ -20,10 +20,11 @@ from configs.arguments import command, read_arguments
 from proprio_mllm.evaluation.lessons import WordsOnly
 from proprio_mllm.model.chat import render
 from proprio_mllm.model.observing import EpisodeLog
-from proprio_mllm.model.prompts import plan_prompt, with_answer
+from proprio_mllm.model.prompts import with_answer
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import answer_words
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
+from proprio_mllm.report.sft import plan_prompt
 
 _STEPS = 50
 
@@ -53,7 +54,7 @@ def counts(episode: WordsOnly, tokenizer: Qwen2Tokenizer, history: int) -> list[
         if job is None:
             break
         said = log.words.tokens(answer_words(job.verb, job.target, step))
-        parts = (shown.visible_objects, shown.known_objects, shown.history, len(shown.history), _STEPS, None, "full", history)
+        parts = (shown.visible_objects, shown.known_objects, shown.history, len(shown.history), _STEPS, history)
         prompt = with_answer(plan_prompt(shown.instruction, shown.robot, *parts), step.to_text())
         own = len(tokenizer(render(prompt))["input_ids"])
         found.append((len(log.log) - before, len(now) + len(said), before, own))

@@ -1,6 +1,6 @@
 """Speed of a chat model in this process: requests and tokens per second at several batch sizes.
 
-    python benchmarks/local_backend.py [--weights weights/tiny/base-0.1] [--requests 32] [--batches 1,8] [--repeats 3]
+    python benchmarks/local_backend.py [--weights weights/tiny/base] [--requests 32] [--batches 1,8] [--repeats 3]
         [--tokens 48]
 
 As many threads as the largest batch ask at once, a planning prompt with a picture of 500 pixels each. Replies are drawn at
@@ -30,7 +30,7 @@ from transformers.utils import logging as transformers_logging
 from configs.schema.backend import BackendConfig
 from proprio_mllm.backends.local import LocalChat
 from proprio_mllm.backends.protocol import ChatImage, ChatMessage, ChatReply, ChatRequest
-from proprio_mllm.model.prompts import plan_prompt
+from proprio_mllm.report.sft import plan_prompt
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ def run(chat: LocalChat, asked: list[ChatRequest], threads: int) -> tuple[Pass, 
 def main() -> int:
     """Prints a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--weights", type=Path, default=Path("weights/tiny/base-0.1"))
+    parser.add_argument("--weights", type=Path, default=Path("weights/tiny/base"))
     parser.add_argument("--requests", type=int, default=32)
     parser.add_argument("--batches", default="1,8")
     parser.add_argument("--repeats", type=int, default=3)

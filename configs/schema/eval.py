@@ -38,7 +38,6 @@ CHAT_KINDS: Final[tuple[PlannerKind, ...]] = ("plain", "llm_planner", "rap", "da
 _OF_KINDS: Final[Mapping[str, tuple[PlannerKind, ...]]] = {
     "adapter": ("mllm",),
     "temperature": ("mllm",),
-    "max_new_tokens": ("mllm",),
     "insist": ("mllm",),
     "blind": ("mllm", *CHAT_KINDS, "file"),
     "replans": (*CHAT_KINDS, "file"),
@@ -66,8 +65,7 @@ class PlannerConfig:
         adapter: adapter to activate; None takes the stored model's first.
         train: command that makes the weights, for the message when they are absent.
         temperature: 0 takes the most likely token.
-        max_new_tokens: longest reply.
-        insist: whether a model that plans from whole episodes may take steps that are bound to be refused by what its log tells
+        insist: whether a stored model may take steps that are bound to be refused by what its log tells
             of hands and states, look for something where it has been, end the task with a step that did nothing, and take a
             third time what was refused twice.
         blind: hides the picture, the robot's own body, or both (`proprio_mllm.evaluation.showing`).
@@ -92,7 +90,6 @@ class PlannerConfig:
     adapter: str | None = None
     train: str = ""
     temperature: float = 0.0
-    max_new_tokens: int = 48
     insist: bool = False
     blind: BlindName = "none"
     image_size: int = 112
@@ -110,7 +107,6 @@ class PlannerConfig:
         require((self.weights is not None) == (self.kind == "mllm"), f"kind {self.kind!r} with weights {self.weights!r}")
         require((self.source is not None) == (self.kind == "file"), f"kind {self.kind!r} with source {self.source!r}")
         require(self.temperature >= 0.0, f"temperature {self.temperature} must not be negative")
-        require(self.max_new_tokens > 0, f"max_new_tokens {self.max_new_tokens} must be positive")
         require(
             self.image_size == 0 or 16 <= self.image_size <= 2048,
             f"image_size {self.image_size} outside [16, 2048]; 0 takes none",

@@ -219,21 +219,17 @@ class ModelConfig:
         prompt: `terse` for models that learn the format, `full` for models that read English.
         vocab_size: rows of the tokenizer trained on the project's text; ignored with `weights`.
         dtype: parameter type.
-        history: earlier steps shown to the planner.
-        episodes: whether it plans from whole episodes in words (`proprio_mllm.model.wording`) in place of prompts.
-        sees: whether a picture stands before each answer of whole episodes; prompts always have one.
-        proprioception: whether prompts, or answers of whole episodes that have a picture, carry motion tokens.
+        sees: whether a picture stands before each answer of an episode (`proprio_mllm.model.wording`).
+        proprioception: whether motion tokens do too.
     """
 
     name: str
     weights: str | None = None
     image_size: int = 112
     prompt: Literal["terse", "full"] = "terse"
-    episodes: bool = False
     sees: bool = False
     vocab_size: int = 1400
     dtype: Literal["float32", "bfloat16"] = "float32"
-    history: int = 4
     proprioception: bool = True
     text: TinyTextConfig = field(default_factory=TinyTextConfig)
     vision: TinyVisionConfig = field(default_factory=TinyVisionConfig)

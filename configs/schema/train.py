@@ -280,5 +280,4 @@ class TrainConfig:
     resume: bool = True
 
     def __post_init__(self) -> None:
-        require(self.model.episodes, "model.episodes false: only models of version 0.1 read prompts; allowed: true")
         require(0 <= self.seed <= LARGEST_SEED, f"seed {self.seed} outside [0, {LARGEST_SEED}]")

@@ -1,6 +1,6 @@
 """Serves a checkpoint as an OpenAI-compatible model on this machine: `make serve`.
 
-    python -m proprio_mllm serve [weights=weights/tiny/base-0.1] [port=8377] [batch=8] [device=auto] [constrained=false]
+    python -m proprio_mllm serve [weights=weights/tiny/base] [port=8377] [batch=8] [device=auto] [constrained=false]
 
 Prints one line when it is ready; Ctrl-C or SIGTERM ends it after the calls under way. Base URL: http://127.0.0.1:8377/v1.
 
@@ -46,7 +46,7 @@ class ServeConfig:
         constrained: whether a request may ask for a JSON schema (extra `constrained`).
     """
 
-    weights: str = "weights/tiny/base-0.1"
+    weights: str = "weights/tiny/base"
     port: int = 8377
     batch: int = 8
     device: str = "auto"

@@ -240,8 +240,7 @@ class Collator:
             places = images.centroids[first : first + named] if images else ()
             grids = [images.grid] * named if images else []
             where = position_ids(ids, self.image_token, grids, places, self.cfg.mpe.mode, example.start)
-            if self.cfg.episodes:  # models of version 0.1 have learnt to read across it
-                self._put_beside(ids, labels, where)
+            self._put_beside(ids, labels, where)
             rows.append((ids, labels, where))
             first += named
         return self._pad(rows, images, side)

@@ -56,7 +56,7 @@ __all__ = [
     "use_adapter",
 ]
 
-_FORMAT = 1
+_FORMAT = 2
 _WEIGHTS, _HEADS = "model.safetensors", "heads.safetensors"
 LORA_TARGETS = r".*language_model\.layers\..*(q|k|v|o|gate|up|down)_proj"
 

@@ -1,7 +1,6 @@
 """From an observation to an example: the one place where a planner at run time and a demonstration in training meet.
 
-Both go through `plan_example`, or `turn_example` where whole episodes are read, so that the model sees the same text, image and
-robot state in training and in use.
+Both go through `turn_example`, so that the model sees the same text, image and robot state in training and in use.
 """
 
 from __future__ import annotations
@@ -16,12 +15,11 @@ from proprio_mllm.model.batch import Example, View
 from proprio_mllm.model.chat import IMAGE, Encoded
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.prompts import plan_prompt, with_answer
 from proprio_mllm.model.vocabulary import motion_text
 from proprio_mllm.model.word_tokens import Tokens, opening
 from proprio_mllm.model.wording import log_words, prefix_words, state_words
 
-__all__ = ["EpisodeLog", "motion_codes", "pictured_turn", "plan_example", "turn_example", "view_of"]
+__all__ = ["EpisodeLog", "motion_codes", "pictured_turn", "turn_example", "view_of"]
 
 
 @dataclass(slots=True)
@@ -67,32 +65,6 @@ def motion_codes(observation: Observation, cfg: ModelConfig, motion: MotionToken
     if motion is None:
         raise ValueError("proprioception=true needs a motion tokenizer, got None")
     return motion.encode_window(observation.proprioception.motion)
-
-
-def plan_example(
-    observation: Observation, cfg: ModelConfig, motion: MotionTokenizer | None, answer: str | None = None
-) -> Example:
-    """The planner's prompt for an observation.
-
-    Args:
-        observation: what the planner sees.
-        cfg: prompt style, history length, proprioception.
-        motion: the motion tokenizer.
-        answer: `PlanStep` text to learn; None leaves the prompt open for generation.
-    """
-    messages = plan_prompt(
-        observation.instruction,
-        observation.robot,
-        observation.visible_objects,
-        observation.known_objects,
-        observation.history,
-        observation.step,
-        observation.time_limit,
-        motion_codes(observation, cfg, motion),
-        cfg.prompt,
-        cfg.history,
-    )
-    return Example(messages if answer is None else with_answer(messages, answer), (view_of(observation),))
 
 
 def turn_example(

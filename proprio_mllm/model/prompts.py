@@ -1,10 +1,10 @@
-"""Every text the model reads or writes, in one place: plans, grounding, motion exercises, judging.
+"""Every text the model reads or writes besides its episodes: grounding, motion exercises, judging.
 
 Two styles with the same content: `full` sentences for models that read English, and `terse` for models that learn the format
 from scratch, where every token costs time. In terse lists object ids follow one another without separators (`Mug_1Cup_2`): an
 id starts with a letter and ends with a digit, so the list is unambiguous, and each id is two tokens.
 
-The paper gives its prompts in part; the wording here is ours. A planner's prompt holds only what an `Observation` holds.
+The paper gives its prompts in part; the wording here is ours.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
-from data.interface.manual import action_manual, code_manual
 from data.interface.observation import HistoryItem
 from proprio_mllm.model.chat import Message
 from proprio_mllm.model.vocabulary import motion_text
@@ -26,7 +25,6 @@ __all__ = [
     "filled_motion",
     "looking",
     "made_motion",
-    "plan_prompt",
     "self_ask_prompt",
     "with_answer",
 ]
@@ -34,13 +32,6 @@ __all__ = [
 Style = Literal["terse", "full"]
 
 _SYSTEM: dict[str, dict[Style, str]] = {
-    "plan": {
-        "terse": "plan",
-        "full": (
-            "You plan for a dual-arm humanoid household robot. Reply with the next step only.\n"
-            f"{action_manual()}\n{code_manual()}"
-        ),
-    },
     "look": {"terse": "look", "full": "You answer questions about what the robot sees, relative to its own body."},
     "judge": {"terse": "judge", "full": "You judge whether a robot reached its goal, from its camera view and its log."},
     "move": {"terse": "move", "full": "You read and write the robot's motion as motion tokens."},
@@ -58,12 +49,6 @@ def _ids(ids: Iterable[str], style: Style) -> str:
     return "".join(listed) if style == "terse" else (", ".join(listed) or "none")
 
 
-def _elsewhere(visible: Sequence[str], known: Sequence[str]) -> list[str]:
-    """Known ids that are not in view."""
-    seen = set(visible)
-    return [name for name in known if name not in seen]
-
-
 def _body(motion: Sequence[int] | None, style: Style) -> str:
     if motion is None:
         return ""
@@ -75,49 +60,6 @@ def _log(history: Sequence[HistoryItem], last: int, style: Style) -> str:
     # The feedback repeats the actions with their results; the step alone stands in where there is none.
     lines = [item.feedback or item.step for item in shown]
     return "\n".join(lines) or ("" if style == "terse" else "nothing yet")
-
-
-def plan_prompt(
-    instruction: str,
-    robot: str,
-    visible: Sequence[str],
-    known: Sequence[str],
-    history: Sequence[HistoryItem],
-    step: int,
-    time_limit: int,
-    motion: Sequence[int] | None = None,
-    style: Style = "terse",
-    last: int = 4,
-) -> tuple[Message, ...]:
-    """The planner's prompt about one image; the reply is `PlanStep` text.
-
-    Args:
-        instruction: the task.
-        robot: robot name.
-        visible: ids in view.
-        known: ids seen so far; those in view are not repeated.
-        history: earlier steps, oldest first; the newest `last` are shown.
-        step: index of the coming step, from 0.
-        time_limit: steps that the task allows.
-        motion: motion tokens of the last seconds, None leaves proprioception out.
-        style: terse or full.
-        last: number of earlier steps shown.
-    """
-    other = _elsewhere(visible, known)
-    if style == "terse":
-        head = (
-            f"{_body(motion, style)}{robot} {step + 1}/{time_limit} {instruction}\n"
-            f"see {_ids(visible, style)}\nknow {_ids(other, style)}\ndid\n"
-        )
-        tail = ""
-    else:
-        head = (
-            f"{_body(motion, style)}Robot: {robot}. Step {step + 1} of {time_limit}.\nTask: {instruction}\n"
-            f"In view: {_ids(visible, style)}\nKnown elsewhere: {_ids(other, style)}\nLast steps:\n"
-        )
-        tail = "\nNext step?"
-    text = f"{head}{_log(history, last, style)}{tail}"
-    return (_system("plan", style), Message("user", text, 1))
 
 
 def with_answer(prompt: Sequence[Message], answer: str) -> tuple[Message, ...]:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from configs.schema.backend import BackendConfig
-from configs.schema.checks import defaults_of, require
 from configs.schema.eval import PlannerConfig
 from proprio_mllm.backends.protocol import Backend
 from proprio_mllm.planners.chat.dag_plan.planner import DagPlanner
@@ -24,27 +23,13 @@ from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 
 __all__ = ["CHAT_PLANNERS", "PLANNERS", "make_chat_planner", "make_planner"]
 
-#: Fields of planners of kind `mllm` that one of its two forms would ignore.
-_OF_PROMPTS: Final = ("max_new_tokens",)
-_OF_EPISODES: Final = ("insist",)
-
 
 def _mllm(cfg: PlannerConfig) -> Planner:
-    from proprio_mllm.planners.mllm import MllmPlanner  # torch loads only where a model is used
-    from proprio_mllm.planners.words import WordsPlanner, plans_in_words
+    from proprio_mllm.planners.words import WordsPlanner  # torch loads only where a model is used
 
     assert cfg.weights is not None
-    whole = plans_in_words(cfg.weights)
-    for name in _OF_PROMPTS if whole else _OF_EPISODES:
-        value, default = getattr(cfg, name), defaults_of(PlannerConfig)[name]
-        reads = "whole episodes" if whole else "a prompt of its own at every step"
-        require(value == default, f"planner.{name} {value!r} with {cfg.weights}, which reads {reads}; allowed: {default!r}")
-    if whole:
-        reflects = cfg.reflection == "on"
-        return WordsPlanner.load(cfg.weights, cfg.temperature, cfg.train, cfg.insist, cfg.adapter, reflects)
-    return MllmPlanner.load(
-        cfg.weights, cfg.adapter, cfg.temperature, cfg.max_new_tokens, cfg.train, reflection=cfg.reflection == "on"
-    )
+    reflects = cfg.reflection == "on"
+    return WordsPlanner.load(cfg.weights, cfg.temperature, cfg.train, cfg.insist, cfg.adapter, reflects)
 
 
 def _random(cfg: PlannerConfig) -> Planner:

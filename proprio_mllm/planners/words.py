@@ -1,15 +1,19 @@
-"""Plans with a model that reads whole episodes in words (`proprio_mllm.model.wording`).
+"""Plans with a stored model: Proprio-MLLM, its ablations, the base model, and the language model alone, through the same class.
+
+What sets them apart is stored with the weights (`config.json`): whether they see, MPE mode, CSE switch, and whether motion
+tokens stand before an answer. All read whole episodes in words (`proprio_mllm.model.wording`).
 
 The episode's log is kept as it grows; before each answer comes the block of what is known now. Answers are held to the grammar
 of actions and to known ids, so no reply is invalid. Steps that are bound to be refused are not taken, nor a third time what was
 refused twice from the same stance: the model's second choice is.
 
-Paper: the language model of Proprio-MLLM before it sees and feels.
+Paper: Proprio-MLLM as embodied planner, with reflection or without (Table III). The paper's prompt is not published. Here
+reflection is what the model was trained for: failed steps stand in the log with their codes, and the next step answers them.
+Without it they are left out of the log, so that the model sees what its steps have changed and nothing of those that failed.
 """
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -39,7 +43,7 @@ from proprio_mllm.model.wording import Words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights, without_failures
 
-__all__ = ["WordsPlanner", "WordsState", "plans_in_words"]
+__all__ = ["WordsPlanner", "WordsState"]
 
 #: Refusals of a step from one stance after which another one is taken.
 _REFUSALS: Final = 2
@@ -88,7 +92,7 @@ class WordsPlanner:
     """A model in this process.
 
     Args:
-        model: one that reads whole episodes, in evaluation mode.
+        model: in evaluation mode.
         motion: the motion tokenizer; needed when the model sees and its answers stand after motion tokens.
         temperature: 0 takes the most likely word.
         insist: whether steps may be taken that are bound to bring nothing (`AnswerGrammar`), or were refused twice.
@@ -198,12 +202,6 @@ class WordsPlanner:
         if state is not None:
             state.cached = len(state.log)
             state.cache.crop(state.cached - state.cache.get_seq_length())  # minus what is no log
-
-
-def plans_in_words(folder: str | Path) -> bool:
-    """Whether a stored model plans from whole episodes in words."""
-    path = Path(folder) / "config.json"
-    return path.is_file() and bool(json.loads(path.read_text(encoding="utf-8"))["config"].get("episodes", False))
 
 
 class _Answer:

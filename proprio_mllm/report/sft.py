@@ -23,15 +23,16 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from data.interface.episode import Outcome
-from data.interface.observation import Observation
+from data.interface.manual import action_manual, code_manual
+from data.interface.observation import HistoryItem, Observation
 from data.shards import encode_png
 from proprio_mllm.evaluation.pool import run_jobs
-from proprio_mllm.model.chat import to_chat
-from proprio_mllm.model.prompts import plan_prompt, with_answer
+from proprio_mllm.model.chat import Message, to_chat
+from proprio_mllm.model.prompts import with_answer
 from proprio_mllm.report.frames import episode_id
 from proprio_mllm.report.reenact import Episode, Moment, Reenactment
 
-__all__ = ["PROPRIOCEPTION_COLUMNS", "SFT_COLUMNS", "RowChoice", "sft_features", "sft_rows"]
+__all__ = ["PROPRIOCEPTION_COLUMNS", "SFT_COLUMNS", "RowChoice", "plan_prompt", "sft_features", "sft_rows"]
 
 logger = logging.getLogger(__name__)
 
@@ -65,6 +66,46 @@ SFT_COLUMNS: Final[Mapping[str, Any]] = {
 PROPRIOCEPTION_COLUMNS: Final[Mapping[str, Any]] = {
     name: datasets.List(_FLOAT) for name in ("motion", "key_bodies", "joint_positions")
 }
+
+
+def plan_prompt(
+    instruction: str,
+    robot: str,
+    visible: Sequence[str],
+    known: Sequence[str],
+    history: Sequence[HistoryItem],
+    step: int,
+    time_limit: int,
+    last: int = 4,
+) -> tuple[Message, ...]:
+    """A planner's prompt about one image, for models that read English; the reply is `PlanStep` text.
+
+    Args:
+        instruction: the task.
+        robot: robot name.
+        visible: ids in view.
+        known: ids seen so far; those in view are not repeated.
+        history: earlier steps, oldest first; the newest `last` are shown.
+        step: index of the coming step, from 0.
+        time_limit: steps that the task allows.
+        last: number of earlier steps shown.
+    """
+    system = (
+        f"You plan for a dual-arm humanoid household robot. Reply with the next step only.\n{action_manual()}\n{code_manual()}"
+    )
+    elsewhere = [name for name in known if name not in set(visible)]
+    # The feedback repeats the actions with their results; the step alone stands in where there is none.
+    log = [item.feedback or item.step for item in list(history)[-last:]] if last else []
+    lines = (
+        f"Robot: {robot}. Step {step + 1} of {time_limit}.",
+        f"Task: {instruction}",
+        f"In view: {', '.join(visible) or 'none'}",
+        f"Known elsewhere: {', '.join(elsewhere) or 'none'}",
+        "Last steps:",
+        *(log or ["nothing yet"]),
+        "Next step?",
+    )
+    return Message("system", system), Message("user", "\n".join(lines), 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +196,7 @@ class _Maker:
         record, task = job.episode.record, job.episode.task
         prompt = plan_prompt(
             seen.instruction, seen.robot, seen.visible_objects, seen.known_objects, seen.history, seen.step, seen.time_limit,
-            style="full", last=self._choice.history,
+            self._choice.history,
         )  # fmt: skip
         row: dict[str, Any] = {
             "messages": to_chat(with_answer(prompt, moment.text)),

@@ -150,15 +150,16 @@ def test_a_device_that_is_not_there_is_refused(folder: Path) -> None:
     assert str(load(folder).model.device) == "cpu"
 
 
-def test_the_base_model_of_this_project_can_answer_and_the_others_cannot() -> None:
+def test_the_base_model_of_this_project_can_answer_and_the_others_cannot(tmp_path: Path) -> None:
     found = find_checkpoint(str(TINY / "base"))
     assert (found.weights.name, found.processing.name, found.model_type) == ("vlm", "processor", "qwen2_5_vl")
     with pytest.raises(
         BackendSetupError, match=r"adapter 'default', mpe.mode=rope_sign, cse.enabled=true, proprioception=true"
     ):
         find_checkpoint(str(TINY / "full"))
+    shutil.copytree(TINY / "base", tmp_path / "shared", ignore=shutil.ignore_patterns("vlm"))
     with pytest.raises(BackendSetupError, match="no weights of its own"):
-        find_checkpoint(str(TINY / "no_mpe_cse"))
+        find_checkpoint(str(tmp_path / "shared"))
 
 
 def test_the_fingerprint_changes_with_the_checkpoint(copy: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,7 +45,7 @@ def ready(process: subprocess.Popen[str]) -> tuple[str, str]:
     line = process.stdout.readline()
     url, _, said = line.partition(" ")
     assert url.startswith("http://127.0.0.1:"), line
-    assert said.startswith("answers as base-0.1: base-0.1@"), line
+    assert said.startswith("answers as base: base@"), line
     return url, said
 
 
@@ -62,11 +62,12 @@ def test_the_tiny_model_is_served(view: Callable[..., ChatImage]) -> None:
         picture = f"data:image/png;base64,{base64.b64encode(view(1).data).decode()}"
         parts: Any = [{"type": "image_url", "image_url": {"url": picture}}, {"type": "text", "text": "left?"}]
         with openai.OpenAI(base_url=url, api_key="none", max_retries=0, timeout=60) as client:
-            chat = functools.partial(client.chat.completions.create, model="base-0.1", temperature=0)
+            chat = functools.partial(client.chat.completions.create, model="base", temperature=0)
             (card,) = client.models.list()
-            assert (card.id, f"base-0.1@{(card.model_extra or {})['revision']}") == ("base-0.1", said.split()[3])
+            assert (card.id, f"base@{(card.model_extra or {})['revision']}") == ("base", said.split()[3])
             seen = chat(messages=[{"role": "system", "content": "look"}, {"role": "user", "content": parts}], max_tokens=20)
-            text = chat(messages=[{"role": "user", "content": "left?"}], max_tokens=1)
+            listing: Any = [parts[0], {"type": "text", "text": "see?"}]
+            text = chat(messages=[{"role": "system", "content": "look"}, {"role": "user", "content": listing}], max_tokens=1)
             with pytest.raises(openai.BadRequestError, match="the model's context of 4096"):
                 chat(messages=[{"role": "user", "content": "left? " * 4000}])
             with pytest.raises(openai.BadRequestError, match="messages: Input should be a valid array"):

@@ -19,7 +19,7 @@ from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.planners.memory_build import MemoryConfig, build_memory
 from tests.planners.demonstrations import write_demos
 
-TINY = Path(__file__).resolve().parents[2] / "weights/tiny/base-0.1"
+TINY = Path(__file__).resolve().parents[2] / "weights/tiny/base"
 
 
 @pytest.fixture(scope="module")

@@ -116,12 +116,12 @@ def test_tap_is_an_action() -> None:
 from data.interface.actions import ACTIONS
 from data.interface.manual import action_manual
 from data.interface.steps import PlanStep
-from proprio_mllm.model.prompts import plan_prompt
+from proprio_mllm.report.sft import plan_prompt
 from sim.session.session import FreePlay, Session
 from sim.tools.catalogue import inventory
 
 assert "- Tap(arm, object): touch an object" in action_manual()
-assert "Tap(arm, object)" in plan_prompt("t", "h1", (), (), (), 0, 5, style="full")[0].text
+assert "Tap(arm, object)" in plan_prompt("t", "h1", (), (), (), 0, 5)[0].text
 assert "Tap" in {row["name"] for row in inventory()["actions"]}
 session = Session("h1", image_size=0)
 session.reset(FreePlay("kitchen_1"), seed=0)

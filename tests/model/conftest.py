@@ -24,7 +24,7 @@ from proprio_mllm.model.batch import Collator, Example, View
 from proprio_mllm.model.building import build_model, build_processor
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.processor import ProprioProcessor
-from proprio_mllm.model.prompts import plan_prompt, with_answer
+from proprio_mllm.model.prompts import critic_prompt, with_answer
 
 TYPES = ("Mug", "Fridge", "CoffeeMachine", "Pan", "Pancake")
 TEXTS = [
@@ -84,10 +84,10 @@ def make_view(rng: np.random.Generator) -> View:
     return View(rng.integers(0, 256, (112, 112, 3), dtype=np.uint8), camera, rng.normal(size=(14, 3)) * 0.3)
 
 
-def make_example(rng: np.random.Generator, known: int = 3, answer: str = "Pick(left, Mug_1)") -> Example:
+def make_example(rng: np.random.Generator, known: int = 3, answer: str = "Pick(left, Mug_1)", felt: bool = True) -> Example:
     names = [f"Pan_{n}" for n in range(1, known + 1)]
     motion = [int(code) for code in rng.integers(0, 16, 4)]
-    prompt = plan_prompt("put the mug into the fridge", "h1", ["Mug_1"], names, [], 0, 8, motion)
+    prompt = critic_prompt("put the mug into the fridge", names, [], motion if felt else None)
     return Example(with_answer(prompt, answer), (make_view(rng),))
 
 
@@ -95,6 +95,12 @@ def make_example(rng: np.random.Generator, known: int = 3, answer: str = "Pick(l
 def examples() -> list[Example]:
     rng = np.random.default_rng(7)
     return [make_example(rng, known=1), make_example(rng, known=4, answer="GoTo(Fridge_1)"), make_example(rng, known=2)]
+
+
+@pytest.fixture
+def plain() -> list[Example]:
+    """Without motion, as Qwen reads them."""
+    return [make_example(np.random.default_rng(number), known=number, felt=False) for number in (1, 4, 2)]
 
 
 @pytest.fixture

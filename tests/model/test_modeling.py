@@ -9,9 +9,9 @@ from proprio_mllm.model.building import add_adapter, build_model
 from proprio_mllm.model.groups import train_only
 
 
-def test_switches_off_give_the_base_model_exactly(cfg, build, examples, switch):
+def test_switches_off_give_the_base_model_exactly(cfg, build, plain, switch):
     model, collate = build(switch(cfg, "mrope", cse=False))
-    batch = collate(examples)
+    batch = collate(plain)
     core = model.core
     types = (batch.input_ids == collate.image_token).int()
     core.model.rope_deltas = None
@@ -39,9 +39,9 @@ def test_switches_off_give_the_base_model_exactly(cfg, build, examples, switch):
     torch.testing.assert_close(ours.loss, theirs.loss, atol=1e-5, rtol=1e-5)
 
 
-def test_position_ids_of_mrope_are_qwens(cfg, build, examples, switch):
+def test_position_ids_of_mrope_are_qwens(cfg, build, plain, switch):
     model, collate = build(switch(cfg, "mrope", cse=False))
-    batch = collate(examples, padding="left")
+    batch = collate(plain, padding="left")
     types = (batch.input_ids == collate.image_token).int()
     theirs, _ = model.core.model.get_rope_index(
         batch.input_ids, types, image_grid_thw=batch.images.grid_thw, attention_mask=batch.attention_mask

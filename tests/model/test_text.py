@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from data.interface.observation import HistoryItem
 from data.interface.steps import Action, PlanStep
 from proprio_mllm.model import prompts, questions
 from proprio_mllm.model.batch import Collator, Example
@@ -128,28 +127,9 @@ def test_processor_loads_the_legacy_layout(processor, tmp_path):
         ProprioProcessor()
 
 
-def _history() -> list[HistoryItem]:
-    return [HistoryItem(f"MoveUp(0.{n})", f"MoveUp(0.{n}) ok" if n else "") for n in range(6)]
-
-
-def test_terse_plan_prompt_by_hand():
-    system, user = prompts.plan_prompt(
-        "tidy up", "h1", ["Mug_1"], ["Mug_1", "Pan_1", "Pan_2"], _history(), 2, 9, [1, 2], last=2
-    )
-    assert system == Message("system", "plan")
-    assert user.images == 1
-    assert user.text == (
-        "<motion_start><motion_1><motion_2><motion_end>h1 3/9 tidy up\nsee Mug_1\nknow Pan_1Pan_2\n"
-        "did\nMoveUp(0.4) ok\nMoveUp(0.5) ok"
-    )
-    bare = prompts.plan_prompt("tidy up", "h1", [], [], _history()[:1], 0, 9)[1].text
-    assert bare == "h1 1/9 tidy up\nsee \nknow \ndid\nMoveUp(0.0)"
-    assert prompts.plan_prompt("tidy up", "h1", [], [], _history(), 0, 9, last=0)[1].text.endswith("did\n")
-
-
 def test_full_prompts_say_the_same():
-    text = prompts.plan_prompt("tidy up", "x1", ["Mug_1"], ["Pan_1"], [], 0, 9, [1], "full")[1].text
-    for part in ("tidy up", "x1", "Step 1 of 9", "Mug_1", "Pan_1", "<motion_1>", "nothing yet"):
+    text = prompts.critic_prompt("tidy up", ["Mug_1"], [], [1], "full")[1].text
+    for part in ("tidy up", "Mug_1", "<motion_1>", "nothing yet"):
         assert part in text
     assert "yes or no" in prompts.critic_prompt("tidy up", [], [], style="full")[1].text
     assert "which open?" in prompts.self_ask_prompt("open", [], [])[1].text
@@ -157,7 +137,7 @@ def test_full_prompts_say_the_same():
     assert prompts.answers([]) == "none"
     assert prompts.answers(["A_1", "B_1"]) == "A_1, B_1"
     with pytest.raises(ValueError, match="style 'loud'"):
-        prompts.plan_prompt("x", "h1", [], [], [], 0, 1, style="loud")
+        prompts.critic_prompt("x", [], [], style="loud")
 
 
 def test_packed_questions_and_motion_exercises(cfg, processor, examples):

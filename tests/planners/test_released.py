@@ -18,7 +18,6 @@ from configs.validate import build
 from data.interface.observation import Observation
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.evaluation.sessions import open_session
-from proprio_mllm.planners.mllm import MllmPlanner
 from proprio_mllm.planners.protocol import TaskInfo
 from proprio_mllm.planners.random_planner import RandomPlanner
 from proprio_mllm.planners.registry import make_planner
@@ -29,18 +28,10 @@ from sim.tasks.task import load_benchmark, write_tasks
 WEIGHTS = Path(__file__).parents[2] / "weights" / "tiny"
 #: Position embedding, cross-spatial encoder, motion tokens.
 PARTS = {
-    "base-0.1": ("mrope", False, False),
     "base": ("mrope", False, False),
     "full": ("rope_sign", True, True),
-    "no_mpe": ("mrope", True, True),
-    "no_cse": ("rope_sign", False, True),
-    "no_mpe_cse": ("mrope", False, True),
-    "no_proprio": ("mrope", False, False),
 }
 EPISODES = ["words", "practice", "base", "pointmap", "tokenizer", "alignment"]
-#: What reads whole episodes, and its stages; the others are of version 0.1.
-STAGES = {"base": EPISODES[:3], "full": EPISODES, "base-0.1": ["base"]}
-EARLIER = ["base", "dagger", "pointmap", "tokenizer", "alignment", "selu"]
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +59,10 @@ def test_words_alone_plan(first: Observation) -> None:
 @pytest.mark.parametrize("name", PARTS)
 def test_it_plans_with_the_parts_of_its_name(name: str, first: Observation) -> None:
     planner = make_planner(PlannerConfig("m", "mllm", "M", str(WEIGHTS / name)))
-    assert isinstance(planner, MllmPlanner | WordsPlanner)
+    assert isinstance(planner, WordsPlanner)
     cfg = planner.model.cfg
-    assert isinstance(planner, MllmPlanner) or not isinstance(planner.model.vlm, PeftModel), "its adapter is folded in"
-    assert cfg.episodes == cfg.sees == (name in ("base", "full"))
+    assert not isinstance(planner.model.vlm, PeftModel), "its adapter is folded in"
+    assert cfg.sees
     assert (cfg.mpe.mode, cfg.cse.enabled, cfg.proprioception) == PARTS[name]
     planner.reset(TaskInfo(first.instruction, first.robot, first.time_limit), np.random.default_rng(0))
     reply = planner.step(first, None)
@@ -86,14 +77,14 @@ def test_it_says_where_it_comes_from(name: str) -> None:
     note = json.loads((WEIGHTS / name / "provenance.json").read_text())
     assert note["seed"] == 0
     assert {"views", "clips"} <= set(note["shards"])
-    assert list(note["stages"]) == STAGES.get(name, EARLIER)
+    assert list(note["stages"]) == (EPISODES[:3] if name == "base" else EPISODES)
     for stage in note["stages"].values():
         assert stage["command"].startswith("python train.py stage=")
         assert stage["metrics"]["seconds"] > 0
-    assert name.startswith("base") or note["variant"] == name
+    assert note["variant"] == "full"
 
 
-@pytest.mark.parametrize("name", ["words", "base", "full"])
+@pytest.mark.parametrize("name", ["words", *PARTS])
 def test_its_card_says_what_its_provenance_does(name: str) -> None:
     text = (WEIGHTS / name / "README.md").read_text()
     assert text == model_card(json.loads((WEIGHTS / name / "provenance.json").read_text()))

@@ -11,6 +11,7 @@ import pytest
 from datasets import load_from_disk
 
 from data.files import file_hash
+from data.interface.observation import HistoryItem
 from data.interface.steps import PlanStep
 from data.motion import N_FEATURES
 from data.shards import decode_motion
@@ -18,6 +19,7 @@ from proprio_mllm.report.export import ExportConfig as Config
 from proprio_mllm.report.export import ExportError, export, main, read_sft, read_traces
 from proprio_mllm.report.html import run_data
 from proprio_mllm.report.runs import load_run
+from proprio_mllm.report.sft import plan_prompt
 from tests.report.ledgers import HOSTILE, LAMP, PLANT, failed, fine, step, write_run
 
 
@@ -160,3 +162,16 @@ def test_pictures_of_traces_are_files(acted_run: Path, tmp_path: Path) -> None:
     assert len(frames) == trace["episode"]["steps"] + 1 and frames[1] == frames[2]
     assert set(frames) | {"episodes.jsonl"} == set(manifest["files"])
     assert trace["episode"]["goals"][0]["since"] == 5
+
+
+def test_a_prompt_by_hand() -> None:
+    history = [HistoryItem(f"MoveUp(0.{n})", f"MoveUp(0.{n}) ok" if n else "") for n in range(6)]
+    system, user = plan_prompt("tidy up", "h1", ["Mug_1"], ["Mug_1", "Pan_1", "Pan_2"], history, 2, 9, last=2)
+    assert "GoTo(object" in system.text and user.images == 1
+    assert user.text == (
+        "Robot: h1. Step 3 of 9.\nTask: tidy up\nIn view: Mug_1\nKnown elsewhere: Pan_1, Pan_2\n"
+        "Last steps:\nMoveUp(0.4) ok\nMoveUp(0.5) ok\nNext step?"
+    )
+    assert plan_prompt("tidy up", "h1", [], [], history[:1], 0, 9)[1].text.endswith("Last steps:\nMoveUp(0.0)\nNext step?")
+    bare = plan_prompt("tidy up", "h1", [], [], history, 0, 9, last=0)[1].text
+    assert "In view: none\nKnown elsewhere: none\nLast steps:\nnothing yet" in bare

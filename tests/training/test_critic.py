@@ -67,7 +67,7 @@ def reader() -> ProprioMLLM:
     """A small model that reads whole episodes in words."""
     whole = build(TrainConfig, compose("train", [])).model
     text = dataclasses.replace(whole.text, hidden=64, layers=2, heads=2, kv_heads=1, intermediate=96)
-    cfg = dataclasses.replace(base_model_config(whole), episodes=True, sees=False, text=text)
+    cfg = dataclasses.replace(base_model_config(whole), sees=False, text=text)
     words = Lessons().words()
     processor = build_processor(cfg, [" ".join(words)] * 2)
     add_word_tokens(processor.tokenizer, words)

@@ -64,7 +64,7 @@ class AlignmentStage:
 
 def start(pipeline: Pipeline) -> ProprioMLLM:
     """The base model with this variant's MPE and CSE and the trained point map."""
-    cfg = dataclasses.replace(variant_model(pipeline.cfg.model, pipeline.cfg.variant), episodes=True, sees=True)
+    cfg = dataclasses.replace(variant_model(pipeline.cfg.model, pipeline.cfg.variant), sees=True)
     point_map = None
     if cfg.cse.enabled:
         point_map = seeded(lambda: build_point_map(cfg), pipeline.cfg.seed)

@@ -42,7 +42,7 @@ class BaseStage:
         if pipeline.needs_no(self.name):
             return {}
         cfg, lessons = pipeline.cfg, pipeline.lessons
-        plain = dataclasses.replace(base_model_config(cfg.model), episodes=True, sees=True)
+        plain = dataclasses.replace(base_model_config(cfg.model), sees=True)
         views, clips = Views(pipeline.paths.shards("views"), plain), Clips(pipeline.paths.shards("clips"))
         demos = lessons_of(pipeline, plain)
         processor = build_processor(plain, corpus(plain, views, clips, cfg.seed), whole_words(views))

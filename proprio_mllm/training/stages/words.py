@@ -52,4 +52,4 @@ class WordsStage:
 
 
 def _plain(model: ModelConfig) -> ModelConfig:
-    return dataclasses.replace(base_model_config(model), episodes=True, sees=False)
+    return dataclasses.replace(base_model_config(model), sees=False)
