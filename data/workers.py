@@ -9,13 +9,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
-import time
 from concurrent.futures import ProcessPoolExecutor
-from typing import Final
 
 __all__ = ["start_worker", "worker_pool"]
-
-_POLL_S: Final = 1.0
 
 
 def worker_pool(workers: int) -> ProcessPoolExecutor:
@@ -27,10 +23,11 @@ def start_worker() -> None:
     """Initializer of a process pool: limits the numeric libraries to one thread and ends this process with its parent."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
-    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def _end_with_parent(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(_POLL_S)
-    os._exit(1)
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()  # returns at once when it was gone before this process had come so far
+        os._exit(1)

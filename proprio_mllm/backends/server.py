@@ -16,11 +16,11 @@ import re
 import socket
 import time
 import uuid
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Annotated, Any, ClassVar, Final, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from data.http_limits import LimitedHandler, LimitedServer, body_length
 from proprio_mllm.backends.protocol import Backend, BackendError, ChatImage, ChatMessage, ChatReply, ChatRequest, RequestError
 
 __all__ = ["ChatServer", "RefusedError", "completion", "model_list", "read_request"]
@@ -105,7 +105,7 @@ class _Given(BaseModel):
         return cls.given
 
 
-class ChatServer(ThreadingHTTPServer):
+class ChatServer(LimitedServer):
     """Serves one backend on 127.0.0.1; `serve_forever` runs until `shutdown` is called from another thread.
 
     Args:
@@ -133,7 +133,7 @@ class ChatServer(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_address[1]}/v1"
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(LimitedHandler):
     """One call on one connection."""
 
     protocol_version = "HTTP/1.1"
@@ -183,12 +183,15 @@ class _Handler(BaseHTTPRequestHandler):
         """The request's body. Only JSON is read: a web page cannot send that here without asking first."""
         if self.headers.get_content_type() != "application/json":
             raise RefusedError(f"Content-Type {self.headers.get_content_type()!r}; expected application/json", 415)
-        length = self.headers.get("Content-Length", "")
-        if not length.isdecimal():
-            raise RefusedError(f"Content-Length {length!r}; expected a number", 411)
-        if int(length) > _BODY_BYTES:
+        told = self.headers.get("Content-Length", "")
+        length = body_length(told)
+        if length is None:
+            raise RefusedError(f"Content-Length {told[:80]!r}; expected a number", 411)
+        if length > _BODY_BYTES:
             raise RefusedError(f"request of {length} bytes; allowed: {_BODY_BYTES}", 413)
-        return self.rfile.read(int(length))
+        body = self.rfile.read(length)
+        self.arrived()
+        return body
 
     def _send(self, status: int, content: dict[str, Any]) -> None:
         """Sends JSON and ends the connection, once the client has stopped sending: else it might not get to read it."""

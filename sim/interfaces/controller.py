@@ -51,6 +51,8 @@ THOR_CODES: Final[Mapping[str, str]] = {
     FailureCode.RECEPTACLE_FULL: "ReceptacleFull",
 }
 #: Actions that need `privileged=True`.
+#: States that are kept at a time; each takes about two megabytes.
+_MOST_SAVED: Final = 100
 _PRIVILEGED: Final = ("TP", "GetInteractablePoses", "SetObjectPoses", "InitialRandomSpawn")
 _MAX_POSES: Final = 1000
 
@@ -291,10 +293,12 @@ class Controller(Stopped):
         return self._act(steps, " & ".join(action.name for action in actions))
 
     def _act(self, steps: Sequence[PlanStep], name: str) -> Event:
-        self._history.add(self.session.snapshot())
+        before = self.session.snapshot()
         outcomes: list[ActionOutcome] = []
         for step in steps:
             _, feedback = self.session.step(step)
+            if not outcomes:  # a step after the end is none
+                self._history.add(before)
             outcomes += feedback.outcomes
             if not feedback.success:
                 break
@@ -326,6 +330,8 @@ class Controller(Stopped):
 
     def _save(self, call: Mapping[str, Any]) -> str:
         name = str(call.get("name", "default"))
+        if name not in self._saved and len(self._saved) >= _MOST_SAVED:
+            raise ValueError(f"SaveState: {_MOST_SAVED} states are saved, no more are kept; Reset forgets them")
         self._saved[name] = self.session.snapshot()
         return name
 

@@ -123,7 +123,8 @@ def _unobstructed(scene: SceneState, camera: int) -> NDArray[np.float64]:
 
 def _camera_id(scene: SceneState, camera: str) -> int:
     name = scene.robot.head_camera if camera == "head" and scene.robot is not None else camera
-    index = mujoco.mj_name2id(scene.model, int(mujoco.mjtObj.mjOBJ_CAMERA), name)
+    known = isinstance(name, str)  # MuJoCo ends the process on anything else
+    index = mujoco.mj_name2id(scene.model, int(mujoco.mjtObj.mjOBJ_CAMERA), name) if known else -1
     if index < 0:
         names = ", ".join(str(scene.model.camera(i).name) for i in range(scene.model.ncam))
         raise ValueError(f"unknown camera {camera!r}; allowed: {names}")

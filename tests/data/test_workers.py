@@ -1,10 +1,17 @@
+"""Worker processes end with the process that made them, at whatever moment it dies."""
+
 from __future__ import annotations
 
+import contextlib
 import os
+import random
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
+
+import pytest
 
 SCRIPT = """
 import time
@@ -20,6 +27,25 @@ if __name__ == "__main__":
 """
 
 
+#: A worker that comes to its initializer only when its parent is long gone, and would then live for a minute.
+LATE = """
+import sys, time
+from multiprocessing import get_context
+from data.workers import start_worker
+
+def late():
+    print(__import__("os").getpid(), flush=True)
+    time.sleep(1.5)
+    start_worker()
+    time.sleep(60)
+
+if __name__ == "__main__":
+    process = get_context("spawn").Process(target=late)
+    process.start()
+    process.join()
+"""
+
+
 def _alive(pid: int) -> bool:
     try:
         with open(f"/proc/{pid}/stat", encoding="utf-8") as stat:
@@ -28,12 +54,12 @@ def _alive(pid: int) -> bool:
         return False
 
 
-def test_workers_end_when_their_parent_is_killed(tmp_path: object) -> None:
-    script = f"{tmp_path}/parent.py"
-    with open(script, "w", encoding="utf-8") as file:
-        file.write(SCRIPT)
+@pytest.mark.parametrize("program", [SCRIPT, LATE], ids=["at work", "still starting"])
+def test_workers_end_when_their_parent_is_killed(program: str, tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(program, encoding="utf-8")
     env = {**os.environ, "PYTHONPATH": os.getcwd()}
-    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True, env=env)
+    parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, env=env)
     assert parent.stdout is not None
     worker = int(parent.stdout.readline())
     assert _alive(worker)
@@ -43,3 +69,30 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: object) -> None:
     while _alive(worker) and time.monotonic() < deadline:
         time.sleep(0.2)
     assert not _alive(worker)
+
+
+@pytest.mark.slow
+def test_no_process_is_left_whenever_its_parent_is_killed(tmp_path: Path) -> None:
+    script, mark = tmp_path / "parent.py", f"{os.getpid()}-{tmp_path.name}"
+    script.write_text(SCRIPT, encoding="utf-8")
+    env = {**os.environ, "PYTHONPATH": os.getcwd(), "LEFT_MARK": mark}
+    rng = random.Random(0)
+    for _ in range(12):
+        parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.DEVNULL, env=env)
+        time.sleep(rng.uniform(0.0, 2.5))
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+    deadline = time.monotonic() + 20
+    while (left := _marked(mark)) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert not left
+
+
+def _marked(mark: str) -> list[int]:
+    """Processes that were started with the mark in their environment."""
+    found: list[int] = []
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):
+            if f"LEFT_MARK={mark}".encode() in path.read_bytes() and _alive(int(path.parent.name)):
+                found.append(int(path.parent.name))
+    return found

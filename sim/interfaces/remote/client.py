@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import http.client
 import json
+import time
 import urllib.error
+import urllib.parse
 import urllib.request
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
+from data.http_limits import is_loopback
 from sim.interfaces.controller import Event, Stopped
 from sim.interfaces.remote.protocol import IMAGES, decode_event, dumps
 
 __all__ = ["RemoteController", "RemoteError"]
+
+
+#: Pauses before a server that nobody listens for is tried again: it may be starting.
+_PAUSES_S: Final = (0.5, 1.5)
 
 
 class RemoteError(RuntimeError):
@@ -45,9 +53,12 @@ class RemoteController(Stopped):
         **arguments: Any,
     ) -> None:
         self._url, self._token, self._images, self._timeout_s = url.rstrip("/"), token, list(images), timeout_s
+        here = is_loopback(urllib.parse.urlsplit(self._url).hostname or "")
+        proxies = [urllib.request.ProxyHandler({})] if here else []
+        self._opener = urllib.request.build_opener(_Staying, *proxies)
+        self._world: str | None = None
         opened = self._ask("POST", "/worlds", arguments | {"images": self._images})
-        self._world: str | None = opened["world"]
-        self.last_event = decode_event(opened["event"])
+        self._world, self.last_event = str(opened.get("world", "")), self._event(opened)
 
     def step(self, action: str | Mapping[str, Any] | None = None, raise_for_failure: bool = False, **arguments: Any) -> Event:
         """As `Controller.step`.
@@ -59,7 +70,7 @@ class RemoteController(Stopped):
         call: dict[str, Any] = dict(action) if isinstance(action, Mapping) else {"action": action}
         call |= arguments
         answer = self._ask("POST", f"/worlds/{self._world}/step", call | {"images": self._images})
-        self.last_event = decode_event(answer["event"])
+        self.last_event = self._event(answer)
         return self.last_event.raise_for_failure() if raise_for_failure else self.last_event
 
     def reset(self, scene: str | None = None, seed: int | None = None) -> Event:
@@ -76,6 +87,12 @@ class RemoteController(Stopped):
             except RemoteError:
                 return
 
+    def _event(self, answer: Mapping[str, Any]) -> Event:
+        try:
+            return decode_event(answer["event"])
+        except (KeyError, TypeError, ValueError, IndexError, OSError) as error:
+            raise RemoteError(f"{self._url}: the answer holds no event: {type(error).__name__}: {error}") from None
+
     def _ask(self, method: str, path: str, body: Mapping[str, Any] | None) -> dict[str, Any]:
         headers = {"Content-Type": "application/json"}
         if self._token is not None:
@@ -85,16 +102,38 @@ class RemoteController(Stopped):
         except (TypeError, ValueError) as error:
             raise ValueError(f"the call cannot be sent as JSON: {error}") from None
         request = urllib.request.Request(self._url + path, data, headers, method=method)
-        try:
-            with urllib.request.urlopen(request, timeout=self._timeout_s) as reply:
-                return json.loads(reply.read())
-        except urllib.error.HTTPError as error:
-            message = _message(error)
-            if error.code == 400:
-                raise ValueError(message) from None
-            raise RemoteError(f"{self._url}: {error.code}: {message}") from None
-        except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
-            raise RemoteError(f"{self._url} cannot be reached: {getattr(error, 'reason', error)}") from None
+        for pause_s in (*_PAUSES_S, None):
+            try:
+                with self._opener.open(request, timeout=self._timeout_s) as reply:
+                    return _object(reply.read())
+            except urllib.error.HTTPError as error:
+                message = _message(error)
+                if error.code == 400:
+                    raise ValueError(message) from None
+                if error.code == 409:
+                    raise RuntimeError(message) from None
+                raise RemoteError(f"{self._url}: {error.code}: {message}") from None
+            except (OSError, http.client.HTTPException, ValueError) as error:
+                reason = getattr(error, "reason", error)
+                # only a call that has not been heard may be made again
+                if pause_s is None or not isinstance(reason, ConnectionRefusedError):
+                    raise RemoteError(f"{self._url} cannot be reached, or makes no sense: {reason}") from None
+                time.sleep(pause_s)
+        raise AssertionError("unreachable")
+
+
+class _Staying(urllib.request.HTTPRedirectHandler):
+    """Follows no redirection: the token is for this server alone."""
+
+    def redirect_request(self, *args: Any, **kwargs: Any) -> None:
+        return None
+
+
+def _object(data: bytes) -> dict[str, Any]:
+    value = json.loads(data)
+    if not isinstance(value, dict):
+        raise ValueError(f"the answer is {type(value).__name__}, no JSON object")
+    return value
 
 
 def _message(error: urllib.error.HTTPError) -> str:

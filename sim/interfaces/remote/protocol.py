@@ -37,7 +37,9 @@ def loads(text: bytes) -> dict[str, Any]:
 
     try:
         value = json.loads(text.decode("utf-8"), parse_constant=refuse)
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except ProtocolError:
+        raise
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits too
         raise ProtocolError(f"the body is no JSON: {error}") from None
     if not isinstance(value, dict):
         raise ProtocolError(f"the body must be a JSON object, got {type(value).__name__}")

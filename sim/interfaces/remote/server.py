@@ -7,18 +7,26 @@ requests that are not `application/json` are refused, so that a web page in a br
 from __future__ import annotations
 
 import hmac
-import ipaddress
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
+from data.http_limits import LimitedHandler, LimitedServer, body_length, has_left, is_loopback
+from data.interface.bodies import DEFAULT_ROBOT
 from sim.interfaces.remote.protocol import VERSION, ProtocolError, dumps, images_of, loads
-from sim.interfaces.remote.worlds import CONTROLLER_ARGUMENTS, WorldGoneError, WorldRefusedError, Worlds
+from sim.interfaces.remote.worlds import (
+    CONTROLLER_ARGUMENTS,
+    WorldBrokeError,
+    WorldGoneError,
+    WorldOverError,
+    WorldRefusedError,
+    Worlds,
+)
+from sim.robots.spec import available_robots
 
-__all__ = ["RemoteServer", "ServerConfig", "is_loopback"]
+__all__ = ["RemoteServer", "ServerConfig"]
 
 _LOG = logging.getLogger(__name__)
 _MAX_BODY: Final = 1 << 20
@@ -52,16 +60,6 @@ class ServerConfig:
             raise ValueError(f"idle_s must be positive, got {self.idle_s}")
 
 
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach an interface."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
-
-
 class RemoteServer:
     """Serves worlds until stopped.
 
@@ -83,7 +81,7 @@ class RemoteServer:
         self.worlds = Worlds(config.worlds, config.idle_s)
         handler = type("Handler", (_Handler,), {"worlds": self.worlds, "token": token, "loopback": is_loopback(config.host)})
         try:
-            self._server = ThreadingHTTPServer((config.host, config.port), handler)
+            self._server = LimitedServer((config.host, config.port), handler)
         except OSError:
             self.worlds.stop()
             raise
@@ -109,7 +107,7 @@ class RemoteServer:
         self.worlds.stop()
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(LimitedHandler):
     worlds: Worlds
     token: str | None
     loopback: bool
@@ -162,6 +160,10 @@ class _Handler(BaseHTTPRequestHandler):
             self._fail(HTTPStatus.NOT_FOUND, str(error))
         except OverflowError as error:
             self._fail(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
+        except WorldOverError as error:
+            self._fail(HTTPStatus.CONFLICT, str(error))
+        except WorldBrokeError as error:
+            self._fail(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
         except (EOFError, OSError):
             self._fail(HTTPStatus.INTERNAL_SERVER_ERROR, "the world's process ended before it answered")
 
@@ -169,20 +171,28 @@ class _Handler(BaseHTTPRequestHandler):
         unknown = sorted(set(body) - set(CONTROLLER_ARGUMENTS))
         if unknown:
             raise ProtocolError(f"unknown argument {unknown[0][:80]!r}; allowed: {', '.join(CONTROLLER_ARGUMENTS)}")
+        robot = body.get("robot_type", DEFAULT_ROBOT)
+        if robot not in available_robots():  # a path would name a file of this machine
+            raise ProtocolError(f"robot_type {str(robot)[:80]!r}; allowed: {', '.join(available_robots())}")
         name, event = self.worlds.open(body, images)
+        if has_left(self.connection):  # while the world was opened; nobody else knows its name
+            self.worlds.close(name)
+            self.close_connection = True
+            return
         self._send(HTTPStatus.OK, {"world": name, "event": event})
 
     def _body(self) -> dict[str, Any] | None:
         kind = self.headers.get("Content-Type", "").partition(";")[0].strip().lower()
-        length = self.headers.get("Content-Length", "")
+        length = body_length(self.headers.get("Content-Length", ""))
         if kind != "application/json":
             self._fail(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, f"Content-Type must be application/json, got {kind[:80]!r}")
             return None
-        if not length.isdigit() or int(length) > _MAX_BODY:
+        if length is None or length > _MAX_BODY:
             self._fail(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a body needs a Content-Length of at most {_MAX_BODY}")
             return None
-        data = self.rfile.read(int(length))
+        data = self.rfile.read(length)
         self._unread = 0
+        self.arrived()
         try:
             return loads(data)
         except ProtocolError as error:
@@ -204,8 +214,7 @@ class _Handler(BaseHTTPRequestHandler):
     def parse_request(self) -> bool:
         """Notes how long the body is, which an answer before it is read has to wait for."""
         fine = super().parse_request()
-        length = self.headers.get("Content-Length", "") if fine else ""
-        self._unread = int(length) if length.isdigit() and len(length) < 12 else 0
+        self._unread = (body_length(self.headers.get("Content-Length", "")) or 0) if fine else 0
         return fine
 
     def _fail(self, status: HTTPStatus, message: str) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 
 from data.workers import start_worker
 
-__all__ = ["WorldGoneError", "WorldRefusedError", "Worlds"]
+__all__ = ["WorldBrokeError", "WorldGoneError", "WorldOverError", "WorldRefusedError", "Worlds"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -33,8 +33,20 @@ class WorldRefusedError(ValueError):
     """What the Controller refused with ValueError."""
 
 
+class WorldOverError(RuntimeError):
+    """A call that came after the end of the episode; the world waits for a reset."""
+
+
+class WorldBrokeError(RuntimeError):
+    """An error of the simulator that is nobody's wrong argument; the world goes on."""
+
+
 class WorldGoneError(LookupError):
     """There is no such world: never opened, closed, expired, or its process died."""
+
+
+#: What a world's process answers in place of an event.
+_ERRORS = {"refused": WorldRefusedError, "over": WorldOverError, "broke": WorldBrokeError}
 
 
 def _serve_world(pipe: Connection, arguments: Mapping[str, Any], images: tuple[str, ...]) -> None:
@@ -58,6 +70,11 @@ def _serve_world(pipe: Connection, arguments: Mapping[str, Any], images: tuple[s
             pipe.send(("event", encode_event(controller.step(call), images)))
         except ValueError as error:
             pipe.send(("refused", str(error)))
+        except RuntimeError as error:
+            pipe.send(("over", str(error)))
+        except Exception as error:  # noqa: BLE001  # a world survives any call
+            _LOG.exception("a call broke")
+            pipe.send(("broke", f"{type(error).__name__}: {error}"))
 
 
 @dataclass
@@ -129,6 +146,8 @@ class Worlds:
         Raises:
             WorldGoneError: when there is no such world, or it died meanwhile.
             WorldRefusedError: when the Controller refuses the call.
+            WorldOverError: when the episode is over.
+            WorldBrokeError: on any other error of the Controller.
         """
         world = self._worlds.get(name)
         if world is None:
@@ -171,8 +190,8 @@ class Worlds:
             world.process.kill()
             raise EOFError
         kind, value = world.pipe.recv()
-        if kind == "refused":
-            raise WorldRefusedError(value)
+        if kind in _ERRORS:
+            raise _ERRORS[kind](value)
         return value
 
     def _reap(self) -> None:

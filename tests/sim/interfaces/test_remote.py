@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
+import http.server
 import json
+import socket
 import threading
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
+from data.http_limits import is_loopback
 from sim.interfaces.controller import Controller
 from sim.interfaces.remote.client import RemoteController, RemoteError
 from sim.interfaces.remote.protocol import ProtocolError, loads
 from sim.interfaces.remote.serve import main
-from sim.interfaces.remote.server import RemoteServer, ServerConfig, is_loopback
+from sim.interfaces.remote.server import RemoteServer, ServerConfig
 
 TOKEN = "a token for the tests"
 SMALL = {"robot_type": "x1", "scene": "bathroom_1", "width": 32, "height": 32}
@@ -109,6 +114,10 @@ def test_who_may_ask(server: RemoteServer) -> None:
         ("POST", "/worlds", b'{"colour": 1}', {}, 400, "unknown argument 'colour'"),
         ("POST", "/worlds", b'{"images": ["xray"]}', {}, 400, "unknown image 'xray'"),
         ("POST", "/worlds", b'{"scene": "attic"}', {}, 400, "unknown room 'attic'"),
+        ("POST", "/worlds", b'{"seed": ' + b"9" * 5000 + b"}", {}, 400, "the body is no JSON"),
+        ("POST", "/worlds", b'{"robot_type": "/etc/robot.yaml"}', {}, 400, "allowed: h1, x1"),
+        ("POST", "/worlds", b'{"robot_type": ["h1"]}', {}, 400, "allowed: h1, x1"),
+        ("POST", "/worlds", b'{"third_party_cameras": [null]}', {}, 400, "unknown camera None"),
         ("POST", "/worlds/nobody/step", b"{}", {}, 404, "no such world"),
         ("POST", "/nothing", b"{}", {}, 404, "allowed: /worlds"),
         ("GET", "/worlds", None, {}, 404, "allowed: /health"),
@@ -121,6 +130,122 @@ def test_bad_requests(
 ) -> None:
     found, text = _status(server, method, path, body, **({"Content-Type": "application/json"} | headers))
     assert found == status and message in text
+
+
+def test_a_world_survives_any_call(server: RemoteServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    far, near = RemoteController(server.url, TOKEN, images=[], **SMALL), Controller(**SMALL)
+    try:
+        for one in (far, near):
+            assert one.step("MoveAhead", amount=0.1).metadata["lastActionSuccess"]
+            one.step("Done")
+            for _ in range(2):
+                with pytest.raises(RuntimeError, match="the episode is over: reset first"):
+                    one.step("MoveAhead")
+            assert one.step("Undo").metadata["actionReturn"] is True, "the refused calls are no steps to go back"
+            assert one.step("MoveAhead", amount=0.1).metadata["lastActionSuccess"]
+        for call, said in (
+            ({"action": 7}, "unknown action '7'"),
+            ({"action": "PickupObject", "objectId": {"a": 1}}, "object id"),
+            ({"action": "LoadState", "name": "x"}, "no saved state 'x'"),
+        ):
+            with pytest.raises(ValueError, match=said):
+                far.step(call)
+        for number in range(100):
+            far.step("SaveState", name=f"s{number}")
+        with pytest.raises(ValueError, match="100 states are saved"):
+            far.step("SaveState", name="one more")
+        assert far.step("SaveState", name="s0").metadata["actionReturn"] == "s0"
+    finally:
+        far.stop()
+        near.stop()
+
+
+def test_a_client_that_leaves_while_its_world_opens_frees_the_place(server: RemoteServer) -> None:
+    body = json.dumps(SMALL).encode()
+    head = (
+        f"POST /worlds HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {TOKEN}\r\n"
+        f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
+    )
+    host, port = server.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port))) as client:
+        client.sendall(head.encode() + body)
+        time.sleep(0.3)
+    deadline = time.monotonic() + 60.0
+    while (server.worlds._opening or len(server.worlds)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert len(server.worlds) == server.worlds._opening == 0
+
+
+class _Liar(http.server.BaseHTTPRequestHandler):
+    """Answers whatever the test wants."""
+
+    answer = b""
+    shown: ClassVar[list[str | None]] = []
+
+    def do_POST(self) -> None:
+        self.shown.append(self.headers.get("Authorization"))
+        self.rfile.read(int(self.headers["Content-Length"]))
+        self.wfile.write(self.answer)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Says nothing."""
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n[]", "no JSON object"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n{}", "holds no event"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\n{}", "makes no sense"),
+        (b'HTTP/1.1 200 OK\r\nContent-Length: 25\r\n\r\n{"world": 1, "event": {}} ', "holds no event"),
+        (b"nonsense", "makes no sense"),
+        (b"", "makes no sense"),
+    ],
+)
+def test_answers_that_make_no_sense_are_one_error(answer: bytes, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_Liar, "answer", answer)
+    with _listening(_Liar) as port, pytest.raises(RemoteError, match=said):
+        RemoteController(f"http://127.0.0.1:{port}", **SMALL)
+
+
+def test_the_token_goes_to_its_own_server_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_Liar, "shown", [])
+    with _listening(_Liar) as other, _listening(_Liar) as port:
+        moved = f"HTTP/1.1 302 Found\r\nLocation: http://127.0.0.1:{other}/worlds\r\nContent-Length: 0\r\n\r\n"
+        monkeypatch.setattr(_Liar, "answer", moved.encode())
+        monkeypatch.setenv("http_proxy", f"http://127.0.0.1:{other}")
+        with pytest.raises(RemoteError, match="302"):
+            RemoteController(f"http://127.0.0.1:{port}", "a secret of the user", **SMALL)
+    assert _Liar.shown == ["Bearer a secret of the user"]
+
+
+def test_a_server_that_is_just_starting_is_waited_for() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    made: list[RemoteServer] = []
+
+    def start() -> None:
+        made.append(RemoteServer(ServerConfig(port=port, worlds=1)))
+        made[0].serve()
+
+    timer = threading.Timer(0.3, start)
+    timer.start()
+    client = RemoteController(f"http://127.0.0.1:{port}", images=[], **SMALL)
+    client.stop()
+    made[0].stop()
+    timer.join(10.0)
+    with pytest.raises(RemoteError, match="cannot be reached"):
+        RemoteController(f"http://127.0.0.1:{port}", **SMALL)
+
+
+@contextlib.contextmanager
+def _listening(handler: type[http.server.BaseHTTPRequestHandler]) -> Iterator[int]:
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield server.server_address[1]
+    server.shutdown()
+    server.server_close()
 
 
 def test_idle_worlds_are_closed() -> None:
