@@ -115,17 +115,18 @@ def _dagger(*args: Any, **kwargs: Any) -> Any:
 
 
 def job(cfg: TrainConfig) -> int:
-    """Runs one configuration; 0 on success, 1 when an input is missing."""
+    """Runs one configuration; 0 on success, 1 when an input is missing or damaged, or nothing can be written."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     for noisy in ("httpx", "datasets", "filelock", "OpenGL"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
+    from data.files import DamagedFileError
     from data.humanml3d import DatasetError
     from data.shards import ShardError
     from proprio_mllm.training.pipeline import StageError
 
     try:
         run(cfg)
-    except (DatasetError, ShardError, StageError) as error:
+    except (DamagedFileError, DatasetError, OSError, ShardError, StageError) as error:
         sys.stderr.write(f"train.py: {error}\n")
         return 1
     return 0

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 import shutil
 import zipfile
@@ -17,7 +18,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["cache_folder", "file_hash", "new_folder", "read_cached", "write_cached", "write_text"]
+__all__ = [
+    "DamagedFileError",
+    "cache_folder",
+    "file_hash",
+    "new_folder",
+    "read_cached",
+    "read_json",
+    "write_cached",
+    "write_text",
+]
+
+
+class DamagedFileError(ValueError):
+    """A file of this project's own that cannot be read; the message names it and what is wrong."""
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object that this project wrote.
+
+    Raises:
+        DamagedFileError: when the file holds anything else, as after a cut.
+        FileNotFoundError: when there is no such file.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise DamagedFileError(f"{path}: damaged: no JSON ({error})") from error
+    if not isinstance(value, dict):
+        raise DamagedFileError(f"{path}: damaged: {type(value).__name__} in place of an object")
+    return value
 
 
 def file_hash(path: Path) -> str:
@@ -61,8 +91,12 @@ def write_text(path: Path, text: str) -> None:
             stream.write(text.encode())
         return
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(text.encode())
-    os.replace(temporary, path)
+    try:
+        temporary.write_bytes(text.encode())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 @contextlib.contextmanager

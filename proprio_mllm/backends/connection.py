@@ -63,14 +63,31 @@ class Secret(logging.Filter):
     def __init__(self, value: str) -> None:
         super().__init__()
         self._value = value
+        parts = dict.fromkeys(value[start : start + _SHORTEST_KEY] for start in range(len(value) - _SHORTEST_KEY + 1))
+        self._parts = re.compile("|".join(map(re.escape, parts))) if parts else None
 
     def reveal(self) -> str:
         """The key itself."""
         return self._value
 
     def redact(self, text: str) -> str:
-        """A text without the key; a key of fewer than 8 characters is no secret and stays."""
-        return text.replace(self._value, "[key]") if len(self._value) >= _SHORTEST_KEY else text
+        """A text without the key, or a part of it of 8 characters or more, as where a reply was cut in its midst.
+
+        A key of fewer characters is no secret and stays.
+        """
+        if self._parts is None:
+            return text
+        kept, last = list[str](), 0
+        for match in self._parts.finditer(text):
+            start, end = match.span()
+            if start < last:
+                continue
+            shift = self._value.find(match[0]) - start
+            while end < len(text) and text[end] == self._value[end + shift : end + shift + 1]:
+                end += 1
+            kept += [text[last:start], "[key]"]
+            last = end
+        return "".join(kept) + text[last:]
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Lets every record pass, without the key."""

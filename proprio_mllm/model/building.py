@@ -19,7 +19,7 @@ import json
 import os
 import shutil
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,19 +27,19 @@ from typing import Any
 import torch
 from peft import LoraConfig as PeftLoraConfig
 from peft import PeftModel, get_peft_model
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from transformers import Qwen2_5_VLForConditionalGeneration
 
 from configs.schema.model import ModelConfig
 from configs.validate import build
-from data.files import file_hash, new_folder
+from data.files import file_hash, new_folder, read_json
 from proprio_mllm.model.backbone import backbone_config
 from proprio_mllm.model.groups import adapter_of
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.point_map import OraclePointMap, SimPointMap
 from proprio_mllm.model.processor import ProprioProcessor, load_processor, make_processor
+from proprio_mllm.model.tensors import check_files, file_hashes, read_tensors, write_tensors
 from proprio_mllm.model.tokenizer import train_tokenizer
 from proprio_mllm.model.vocabulary import add_motion_tokens
 
@@ -54,6 +54,7 @@ __all__ = [
     "save_model",
     "share_backbone",
     "use_adapter",
+    "write_stored",
 ]
 
 _FORMAT = 2
@@ -238,11 +239,11 @@ def save_model(model: ProprioMLLM, folder: str | Path, motion: MotionTokenizer |
             (work / "vlm").mkdir()
             if model.core.config.tie_word_embeddings:
                 state.pop("lm_head.weight", None)
-            save_file({k: v.contiguous() for k, v in state.items()}, work / "vlm" / _WEIGHTS, {"format": "pt"})
+            write_tensors({k: v.contiguous() for k, v in state.items()}, work / "vlm" / _WEIGHTS)
             model.core.config.save_pretrained(str(work / "vlm"))
         else:
             heads |= {f"backbone.{k}": v for k, v in state.items() if ".visual.merger." in k}
-        save_file({k: v.clone().contiguous() for k, v in heads.items()}, work / _HEADS)
+        write_tensors({k: v.clone().contiguous() for k, v in heads.items()}, work / _HEADS)
         adapters: list[str] = []
         if isinstance(model.vlm, PeftModel):
             adapters = list(model.vlm.peft_config)
@@ -256,8 +257,13 @@ def save_model(model: ProprioMLLM, folder: str | Path, motion: MotionTokenizer |
                 stray.unlink()
         if motion is not None:
             motion.save(work / "motion")
-        stored = {"format": _FORMAT, "config": dataclasses.asdict(model.cfg), "adapters": adapters}
-        (work / "config.json").write_text(json.dumps(stored, indent=2) + "\n", encoding="utf-8")
+        write_stored(work, {"format": _FORMAT, "config": dataclasses.asdict(model.cfg), "adapters": adapters})
+
+
+def write_stored(folder: Path, stored: Mapping[str, Any]) -> None:
+    """Writes a stored model's `config.json`, with the checksums of its files as they are now."""
+    text = json.dumps({**stored, "files": file_hashes(folder)}, indent=2)
+    (folder / "config.json").write_text(text + "\n", encoding="utf-8")
 
 
 def load_model(folder: str | Path, adapter: str | None = None, trainable: bool = False) -> ProprioMLLM:
@@ -269,18 +275,20 @@ def load_model(folder: str | Path, adapter: str | None = None, trainable: bool =
         trainable: whether adapters keep their gradients.
 
     Raises:
+        DamagedFileError: when a file of it is not what was written.
         ValueError: on an unknown format or adapter, or when a shared backbone is missing or another one.
     """
     folder = Path(folder)
-    stored = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    stored = read_json(folder / "config.json")
     if stored.get("format") != _FORMAT:
         raise ValueError(f"{folder}: model format {stored.get('format')!r}; this version reads {_FORMAT}")
+    check_files(folder, stored.get("files", {}))
     cfg = build(ModelConfig, stored["config"], "model")
     processor = load_processor(folder / "processor", cfg.image_size)
     local = dataclasses.replace(cfg, weights=str(_backbone(folder, stored))) if cfg.weights is None else cfg
     model = build_model(local, processor)
     model.cfg = cfg
-    heads = load_file(folder / _HEADS)
+    heads = read_tensors(folder / _HEADS)
     merger = {k.removeprefix("backbone."): v for k, v in heads.items() if k.startswith("backbone.")}
     model.core.load_state_dict(merger, strict=False)
     own = {k: v for k, v in heads.items() if not k.startswith("backbone.")}
@@ -313,16 +321,16 @@ def share_backbone(folder: str | Path, owner: str | Path) -> None:
         ValueError: when the backbones have different tensors.
     """
     folder, owner = Path(folder), Path(owner)
-    ours, theirs = (load_file(path / "vlm" / _WEIGHTS) for path in (folder, owner))
+    ours, theirs = (read_tensors(path / "vlm" / _WEIGHTS) for path in (folder, owner))
     if {k: v.shape for k, v in ours.items()} != {k: v.shape for k, v in theirs.items()}:
         raise ValueError(f"{folder} and {owner} have backbones of different architectures")
     moved = {f"backbone.{k}": v for k, v in ours.items() if not torch.equal(v, theirs[k])}
-    save_file({**load_file(folder / _HEADS), **moved}, folder / _HEADS)
-    stored = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    write_tensors({**read_tensors(folder / _HEADS), **moved}, folder / _HEADS)
+    stored = read_json(folder / "config.json")
     path = owner / "vlm"
     stored["backbone"] = {"folder": os.path.relpath(path, folder), "sha256": file_hash(path / _WEIGHTS)}
-    (folder / "config.json").write_text(json.dumps(stored, indent=2) + "\n", encoding="utf-8")
     shutil.rmtree(folder / "vlm")
+    write_stored(folder, stored)
 
 
 def _backbone(folder: Path, stored: dict[str, Any]) -> Path:

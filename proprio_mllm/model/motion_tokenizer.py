@@ -23,14 +23,14 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
 from configs.schema.model import MotionTokenizerConfig
 from configs.validate import build
-from data.files import write_text
+from data.files import read_json, write_text
 from proprio_mllm.model.quantizer import MotionQuantizer
+from proprio_mllm.model.tensors import read_tensors, write_tensors
 
 __all__ = ["MotionTokenizer", "TokenizerLoss"]
 
@@ -186,7 +186,7 @@ class MotionTokenizer(nn.Module):
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps({"format": _FORMAT, "config": dataclasses.asdict(self.cfg)}, indent=2)
-        save_file({k: v.contiguous() for k, v in self.state_dict().items()}, folder / "model.safetensors.tmp")
+        write_tensors({k: v.contiguous() for k, v in self.state_dict().items()}, folder / "model.safetensors.tmp")
         os.replace(folder / "model.safetensors.tmp", folder / "model.safetensors")
         write_text(folder / "config.json", text + "\n")
 
@@ -198,9 +198,9 @@ class MotionTokenizer(nn.Module):
             ValueError: on an unknown format.
         """
         folder = Path(folder)
-        stored = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        stored = read_json(folder / "config.json")
         if stored.get("format") != _FORMAT:
             raise ValueError(f"{folder}: motion tokenizer format {stored.get('format')!r}; this version reads {_FORMAT}")
         tokenizer = MotionTokenizer(build(MotionTokenizerConfig, stored["config"], "motion"))
-        tokenizer.load_state_dict(load_file(folder / "model.safetensors"))
+        tokenizer.load_state_dict(read_tensors(folder / "model.safetensors"))
         return tokenizer.eval()

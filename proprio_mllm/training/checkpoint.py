@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from data.files import new_folder
+from data.files import new_folder, read_json
+from proprio_mllm.model.tensors import check_files, file_hashes, read_tensors, write_tensors
 
 __all__ = ["load_checkpoint", "save_checkpoint"]
 
@@ -32,28 +31,31 @@ def save_checkpoint(
         seconds: time spent so far.
     """
     with new_folder(folder) as work:
-        save_file(_trained(module), work / "model.safetensors")
+        write_tensors(_trained(module), work / "model.safetensors")
         state = optimizer.state_dict()["state"]
         entries = [(f"{index}.{name}", value) for index, entry in state.items() for name, value in entry.items()]
         flat = {name: torch.as_tensor(value).contiguous() for name, value in entries}
-        save_file(flat, work / "optimizer.safetensors")
-        (work / "state.json").write_text(json.dumps({"step": step, "key": key, "seconds": seconds}), encoding="utf-8")
+        write_tensors(flat, work / "optimizer.safetensors")
+        told = {"step": step, "key": key, "seconds": seconds, "files": file_hashes(work)}
+        (work / "state.json").write_text(json.dumps(told), encoding="utf-8")
 
 
 def load_checkpoint(folder: Path, module: nn.Module, optimizer: torch.optim.Optimizer, key: str) -> tuple[int, float]:
     """Restores a checkpoint and returns its step and seconds spent; zeros when there is none, or it is of another run.
 
     Raises:
+        DamagedFileError: when a file of it is not what was written.
         ValueError: when the checkpoint holds other tensors than the module trains.
     """
     if not (folder / "state.json").is_file():
         folder = folder.with_name(folder.name + ".old")
     if not (folder / "state.json").is_file():
         return 0, 0.0
-    state: dict[str, Any] = json.loads((folder / "state.json").read_text(encoding="utf-8"))
-    if state["key"] != key:
+    state = read_json(folder / "state.json")
+    if state.get("key") != key:
         return 0, 0.0
-    tensors = load_file(folder / "model.safetensors")
+    check_files(folder, state.get("files", {}))
+    tensors = read_tensors(folder / "model.safetensors")
     own = _trained(module)
     if set(own) != set(tensors):
         raise ValueError(f"{folder}: checkpoint holds other tensors than the model: {sorted(set(own) ^ set(tensors))[:4]}")
@@ -61,7 +63,7 @@ def load_checkpoint(folder: Path, module: nn.Module, optimizer: torch.optim.Opti
         for name, tensor in own.items():
             tensor.copy_(tensors[name])
     entries: dict[int, dict[str, Tensor]] = {}
-    for name, tensor in load_file(folder / "optimizer.safetensors").items():
+    for name, tensor in read_tensors(folder / "optimizer.safetensors").items():
         index, _, field = name.partition(".")
         entries.setdefault(int(index), {})[field] = tensor
     optimizer.load_state_dict({"state": entries, "param_groups": optimizer.state_dict()["param_groups"]})

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import io
 import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from configs.schema.train import LoggerConfig
+from data.files import write_text
 
 __all__ = ["MetricWriter"]
 
@@ -54,10 +56,11 @@ class MetricWriter:
         row = {"step": str(step), **{name: f"{value:.6g}" for name, value in values.items()}}
         self._rows.append(row)
         columns = list(dict.fromkeys(name for one in self._rows for name in one))
-        with self._path.open("w", newline="", encoding="utf-8") as handle:
-            table = csv.DictWriter(handle, columns)
-            table.writeheader()
-            table.writerows(self._rows)
+        text = io.StringIO(newline="")
+        table = csv.DictWriter(text, columns)
+        table.writeheader()
+        table.writerows(self._rows)
+        write_text(self._path, text.getvalue())
         if self._run is not None:
             self._run.log(dict(values), step=step)
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from configs.schema.train import TrainConfig
-from data.files import write_text
+from data.files import read_json, write_text
 from data.shards import config_hash
 
 __all__ = ["StagePaths", "finish", "finished_key", "stage_key"]
@@ -56,7 +56,7 @@ def finished_key(folder: Path) -> str | None:
     path = folder / "done.json"
     if not path.is_file():
         return None
-    return str(json.loads(path.read_text(encoding="utf-8"))["key"])
+    return str(read_json(path).get("key"))
 
 
 def finish(folder: Path, key: str, metrics: Mapping[str, Any], command: str = "") -> None:

@@ -21,10 +21,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-from safetensors.torch import load_file, save_file
-
-from data.files import new_folder
-from proprio_mllm.model.building import share_backbone
+from data.files import new_folder, read_json
+from proprio_mllm.model.building import share_backbone, write_stored
+from proprio_mllm.model.tensors import read_tensors, write_tensors
 from proprio_mllm.training.card import model_card
 from proprio_mllm.training.paths import finished_key
 from proprio_mllm.training.pipeline import Pipeline
@@ -90,20 +89,20 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
 
 def _released_key(target: Path) -> str | None:
     path = target / "provenance.json"
-    return str(json.loads(path.read_text(encoding="utf-8"))["key"]) if path.is_file() else None
+    return str(read_json(path)["key"]) if path.is_file() else None
 
 
 def _shrink(folder: Path) -> None:
     """Halves floating-point weights and drops the critic's adapter."""
     shutil.rmtree(folder / "adapters" / CRITIC, ignore_errors=True)
-    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    config = read_json(folder / "config.json")
     config["adapters"] = [name for name in config["adapters"] if name != CRITIC]
-    (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
     for path in folder.rglob("*.safetensors"):
         if path.parent == folder / "motion":
             continue
-        tensors = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in load_file(path).items()}
-        save_file(tensors, path, {"format": "pt"})
+        tensors = read_tensors(path)
+        write_tensors({name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}, path)
+    write_stored(folder, config)
 
 
 def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
@@ -114,7 +113,7 @@ def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
             shards[kind] = shard_hash(folder)
     stages = {}
     for name in pipeline.ancestors(stage):
-        record = json.loads((pipeline.paths.stage(name) / "done.json").read_text(encoding="utf-8"))
+        record = read_json(pipeline.paths.stage(name) / "done.json")
         stages[name] = {"command": record.get("command", ""), "metrics": record["metrics"]}
     return {
         "stage": stage,

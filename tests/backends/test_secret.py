@@ -101,3 +101,22 @@ def test_keys_that_cannot_be_sent(monkeypatch, value: str) -> None:
 def test_spaces_around_a_key_are_not_sent(monkeypatch) -> None:
     monkeypatch.setenv("TEST_API_KEY", f" {KEY}\n")
     assert read_secret("TEST_API_KEY", "tested", optional=False).reveal() == KEY
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("you sent sk-proj-4f9Qm2xLr8Tz", "you sent [key]"),  # a reply that was cut in the midst of the key
+        ("sk-proj-4f9Qm2xLr8TzBv61 and sk-proj-4f9Qm2xLr8TzBv61", "[key] and [key]"),
+        ("ends in 2xLr8TzBv61.", "ends in [key]."),
+        ("sk-proj", "sk-proj"),
+        ("sk-proj-4f9Qm2xLr8TzBv61sk-proj-4f9Qm", "[key][key]"),
+        ("nothing of it", "nothing of it"),
+    ],
+)
+def test_parts_of_a_key_are_taken_out_too(text: str, shown: str) -> None:
+    assert Secret("sk-proj-4f9Qm2xLr8TzBv61").redact(text) == shown
+
+
+def test_a_short_key_is_no_secret() -> None:
+    assert Secret("none").redact("none of them") == "none of them"

@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from safetensors.torch import load_file
-
 from proprio_mllm.model.building import add_adapter, build_model, build_point_map, build_processor, load_model, save_model
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.model.tensors import read_tensors
 from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, body_state_accuracy
 from proprio_mllm.training.base import grounding_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded, variant_model
@@ -69,7 +68,7 @@ def start(pipeline: Pipeline) -> ProprioMLLM:
     if cfg.cse.enabled:
         point_map = seeded(lambda: build_point_map(cfg), pipeline.cfg.seed)
         if point_map is not None and cfg.point_map.encoder == "sim":
-            point_map.load_state_dict(load_file(pipeline.paths.stage("pointmap") / "checkpoint" / "model.safetensors"))
+            point_map.load_state_dict(read_tensors(pipeline.paths.stage("pointmap") / "checkpoint" / "model.safetensors"))
     if cfg.weights is None:
         base = load_model(pipeline.paths.model("base"))
         local = dataclasses.replace(cfg, weights=str(pipeline.paths.model("base") / "vlm"))

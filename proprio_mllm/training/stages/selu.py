@@ -11,7 +11,6 @@ proportion of stage 2; the abstract of SELU mentions no replay.
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from configs.schema.train import LoopConfig
+from data.files import read_json
 from data.shards import config_hash
 from proprio_mllm.model.batch import Batch, Collator, Example
 from proprio_mllm.model.building import add_adapter, load_model, save_model, use_adapter
@@ -169,7 +169,7 @@ class _Selu:
         folder, key = self.folder / f"round_{number}", f"{self.key}/{number}"
         if finished_key(folder) == key and not self.pipeline.cfg.overwrite:
             logger.info("selu: round %d is complete", number)
-            return json.loads((folder / "done.json").read_text(encoding="utf-8"))["metrics"]
+            return read_json(folder / "done.json")["metrics"]
         (folder / "done.json").unlink(missing_ok=True)
         if self.pipeline.cfg.overwrite:  # the actor may be another one under the same key
             shutil.rmtree(folder / "rollouts", ignore_errors=True)
