@@ -30,6 +30,11 @@ _LACKING: Final = {
     LEDGER_VERSION: frozenset(),
 }
 
+_COUNTED: Final = (
+    "trial", "invalid_output", "steps", "makespan_s", "path_length_m", "arm_utilisation", "planner_calls", "planner_tokens",
+    "planner_s", "wall_s", "cached_calls", "reflections",
+)  # fmt: skip
+
 #: (planner, robot, task, difficulty, trial, seed, config hash)
 EpisodeKey = tuple[str, str, str, str, int, int, str]
 
@@ -60,7 +65,7 @@ def from_json(raw: Mapping[str, Any]) -> EpisodeRecord:
     """Reads `to_json` back, and lines of versions 1 and 2.
 
     Raises:
-        LedgerError: on another version, missing or unknown fields, or a value of another type.
+        LedgerError: on another version, missing or unknown fields, or a value of another type or that no episode has.
     """
     values = dict(raw)
     version = values.pop("version", None)
@@ -70,9 +75,22 @@ def from_json(raw: Mapping[str, Any]) -> EpisodeRecord:
     if set(values) != names:
         raise LedgerError(f"missing fields {sorted(names - set(values))}, unknown fields {sorted(set(values) - names)}")
     try:
-        return build(EpisodeRecord, values)
+        record = build(EpisodeRecord, values)
     except ConfigError as error:
         raise LedgerError(str(error)) from error
+    if not 0.0 <= record.goal_conditions_met <= 1.0:
+        raise LedgerError(f"goal_conditions_met {record.goal_conditions_met} outside [0, 1]")
+    below = [name for name in _COUNTED if getattr(record, name) < 0]
+    if below:
+        raise LedgerError(f"{below[0]} {getattr(record, below[0])} is below 0")
+    broke = record.outcome is Outcome.INFRASTRUCTURE_ERROR
+    if not broke and (record.failure is None) != (record.outcome is Outcome.SUCCESS):
+        raise LedgerError(f"outcome {record.outcome.value!r} with failure {record.failure!r}")
+    return record
+
+
+def _no_number(word: str) -> float:
+    raise ValueError(f"{word} is no JSON number")
 
 
 def read_ledger(path: Path) -> list[EpisodeRecord]:
@@ -87,7 +105,7 @@ def read_ledger(path: Path) -> list[EpisodeRecord]:
     lines = path.read_bytes().split(b"\n")[:-1]  # what follows the last line end was cut short
     for number, line in enumerate(lines, start=1):
         try:
-            records.append(from_json(json.loads(line)))
+            records.append(from_json(json.loads(line, parse_constant=_no_number)))
         except (ValueError, TypeError, AttributeError) as error:
             raise LedgerError(f"{path}, line {number}: {error}") from error
     return records

@@ -91,10 +91,14 @@ def found(path: str) -> Path:
     return here if here.exists() or here.is_absolute() else _ROOT / here
 
 
+def _decides(path: Path) -> bool:
+    return path.suffix in (".safetensors", ".json", ".jinja", ".txt") and path.name != "provenance.json"
+
+
 def weights_digest(folder: Path) -> str:
-    """Short hash over the files of a stored model."""
+    """Short hash over the files of a stored model, but not over where it comes from."""
     digest = hashlib.sha256()
-    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix in (".safetensors", ".json", ".jinja", ".txt")):
+    for path in sorted(p for p in folder.rglob("*") if p.is_file() and _decides(p)):
         digest.update(path.relative_to(folder).as_posix().encode())
         digest.update(bytes.fromhex(file_hash(path)))
     return digest.hexdigest()[:16]

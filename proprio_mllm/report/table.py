@@ -33,6 +33,11 @@ def latex_text(text: str) -> str:
     return "".join(_LATEX.get(sign, sign) for sign in " ".join(text.split()))
 
 
+def _plain(cell: str) -> str:
+    """A cell of Markdown that neither ends early nor draws anything: names of models are what servers say."""
+    return "".join(f"\\{sign}" if sign in "|<>`\\" else sign for sign in " ".join(cell.split()))
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
     """A titled grid of text.
@@ -59,10 +64,10 @@ class Table:
 
     def to_markdown(self) -> str:
         """The table with its title and notes."""
-        widths = [max(len(cell) for cell in column) for column in zip(self.columns, *self.rows, strict=True)]
+        widths = [max(len(_plain(cell)) for cell in column) for column in zip(self.columns, *self.rows, strict=True)]
 
         def line(cells: Sequence[str]) -> str:
-            return "| " + " | ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)) + " |"
+            return "| " + " | ".join(cell.ljust(width) for cell, width in zip(map(_plain, cells), widths, strict=True)) + " |"
 
         rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
         notes = [f"\n{note}" for note in self.notes]

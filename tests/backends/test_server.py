@@ -100,7 +100,7 @@ def test_errors_are_openais(client: openai.OpenAI) -> None:
 
 
 def test_calls_that_are_no_chats_are_refused(served: ChatServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    chat = "POST /v1/chat/completions HTTP/1.1\nHost: x\nContent-Type: application/json"
+    chat = "POST /v1/chat/completions HTTP/1.1\nHost: localhost\nContent-Type: application/json"
     assert raw(served, "GET /v1/other HTTP/1.1") == (
         404,
         error("no such path: /v1/other; allowed: /v1/chat/completions, /v1/models"),
@@ -131,3 +131,17 @@ def test_only_this_machine_is_listened_to(served: ChatServer) -> None:
 
 def error(message: str) -> dict[str, Any]:
     return {"error": {"message": message, "type": "invalid_request_error", "param": None, "code": None}}
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("127.0.0.1", 200), ("localhost:{port}", 200), ("[::1]:{port}", 200), ("[::1]", 200),
+        ("evil.example:{port}", 403), ("evil.example", 403), ("", 403), ("127.0.0.1.evil.example", 403),
+    ],
+)  # fmt: skip
+def test_a_page_under_another_name_is_not_answered(served: ChatServer, host: str, status: int) -> None:
+    port = served.server_address[1]
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as client:
+        client.sendall(f"GET /v1/models HTTP/1.1\r\nHost: {host.format(port=port)}\r\n\r\n".encode())
+        assert client.recv(100).startswith(f"HTTP/1.1 {status} ".encode())

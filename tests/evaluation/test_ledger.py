@@ -68,6 +68,11 @@ def test_two_writers_are_one_too_many(tmp_path, record) -> None:
         ({"outcome": "won"}, "won"),
         ({"planner_tokens": None}, "planner_tokens: expected int, got None"),
         ({"steps": "7"}, "steps: expected int, got '7'"),
+        ({"planner_s": float("nan")}, "NaN is no JSON number"),
+        ({"goal_conditions_met": 5.0}, r"goal_conditions_met 5\.0 outside"),
+        ({"steps": -1}, "steps -1 is below 0"),
+        ({"outcome": "success", "failure": "logical"}, "outcome 'success' with failure"),
+        ({"outcome": "failure", "failure": None}, "outcome 'failure' with failure None"),
         ({"trace": ["Done()"]}, r"trace\[0\]: expected a mapping, got 'Done\(\)'"),
     ],
 )

@@ -298,3 +298,10 @@ def test_success_in_time_is_counted_apart_from_success() -> None:
     assert (row.successes, row.in_time, row.stuck, row.episodes) == (2, 1, 1, 3)
     assert (row.in_time_rate, row.in_time_low, row.in_time_high) == pytest.approx((1 / 3, *wilson(1, 3)))
     assert in_time_cell(row) == "33.3 [6.1, 79.2] 1/3" and rate_cell(row).endswith("2/3")
+
+
+def test_a_name_draws_nothing_in_markdown() -> None:
+    text = Table("t", ("a", "b"), (("x | y\n| z", "<img src=x>"), ("`code`", "plain"))).to_markdown()
+    lines = text.splitlines()[2:]
+    assert lines[2].replace("\\|", "").count("|") == 3 and r"x \| y \| z" in lines[2] and r"\<img src=x\>" in lines[2]
+    assert r"\`code\`" in lines[3] and len({len(line) for line in lines}) == 1
