@@ -48,6 +48,7 @@ def make_shards(cfg: TrainConfig) -> None:
         shards = ShardConfig(
             kind=kind, out=str(StagePaths(cfg).shards(name)), count=count, seed=cfg.seed, image_size=cfg.model.image_size,
             part_size=part, workers=cfg.collect.workers, robots=cfg.data.robots,
+            foreseen=cfg.collect.foreseen and name == "lessons",
         )  # fmt: skip
         write = collect_lessons if name == "lessons" else collect
         write(shards, overwrite=cfg.overwrite, progress=_progress(name))

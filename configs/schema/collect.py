@@ -25,6 +25,7 @@ class CollectConfig:
         views_per_world: views drawn from one arrangement of objects.
         noise: demos: probability that a perturbed step is executed in place of the expert's, whose choice is recorded.
         medium_share: demos: share of episodes at medium difficulty, so that recoveries appear.
+        foreseen: lessons: whether the right step is the one that the reach test foresees (`sim.collection.demonstrations`).
     """
 
     kind: Literal["views", "demos"]
@@ -39,6 +40,7 @@ class CollectConfig:
     views_per_world: int = 48
     noise: float = 0.2
     medium_share: float = 0.15
+    foreseen: bool = False
 
     def __post_init__(self) -> None:
         for name in ("count", "image_size", "part_size", "workers", "views_per_world"):

@@ -217,11 +217,14 @@ class CollectStageConfig:
     Attributes:
         views: posed views.
         lessons: episodes of the rules, with mistakes among their steps.
+        foreseen: whether what is out of reach is foreseen in lessons and practice: the right step of a decision with a picture
+            is then the one that the rules would come to after the failure.
         workers: processes.
     """
 
     views: int = 6000
     lessons: int = 500
+    foreseen: bool = False
     workers: int = 2
 
 

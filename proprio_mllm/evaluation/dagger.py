@@ -51,7 +51,7 @@ def collect_dagger(request: DaggerRequest, robots: Sequence[str] = PAPER_ROBOTS,
     """
     config = CollectConfig(
         "demos", str(request.folder), request.episodes, tuple(robots), seed=request.seed, image_size=request.image_size,
-        part_size=_PER_PART, noise=request.teacher_share, workers=workers,
+        part_size=_PER_PART, noise=request.teacher_share, workers=workers, foreseen=request.foreseen,
     )  # fmt: skip
     model = str(request.model)
     job = functools.partial(_lessons, config, student=model)
@@ -76,7 +76,9 @@ def collect_lessons(
         overwrite: start over when the folder holds something else.
     """
     keyed = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "workers")}
-    keyed["version"] = 2
+    if not keyed["foreseen"]:
+        del keyed["foreseen"]
+    keyed["version"] = 1
     report = progress or (lambda done, parts: None)
     return _write(config, config_hash(keyed), functools.partial(_lessons, config), {"config": keyed}, report, overwrite)
 

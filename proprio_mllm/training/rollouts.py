@@ -61,6 +61,7 @@ class DaggerRequest:
         teacher_share: share of the steps that the teacher takes itself.
         image_size: side of the pictures, pixels.
         config_hash: hash to store in the shard's manifest.
+        foreseen: whether the right step is the one that the reach test foresees.
     """
 
     model: Path
@@ -70,6 +71,7 @@ class DaggerRequest:
     teacher_share: float
     image_size: int
     config_hash: str
+    foreseen: bool = False
 
 
 class RolloutCollector(Protocol):

@@ -65,7 +65,7 @@ def collect(config: CollectConfig, progress: Callable[[int, int], None] | None =
     Raises:
         data.shards.ShardError: when the folder holds something else and `overwrite` is off.
     """
-    keyed = {k: v for k, v in dataclasses.asdict(config).items() if k not in _UNKEYED[config.kind]} | {
+    keyed = {k: v for k, v in dataclasses.asdict(config).items() if k not in (*_UNKEYED[config.kind], "foreseen")} | {
         "version": _VERSION[config.kind]
     }
     writer = ShardWriter(Path(config.out), config.kind, config_hash(keyed), overwrite)

@@ -11,8 +11,8 @@ ends the episode, in a share of the steps, and after as many steps as the task a
 
 Lessons are episodes with another teacher, a function of what a planner reads, at the controls: right steps, mistakes and a
 student's steps, each kept with the teacher's answer whether the goals are met in the end or not. What that teacher cannot read
-before its first try, how high, how far and which arm, the simulator's reach test foresees (`foreseen`): such an answer is one
-for planners that see and feel.
+before its first try, how high, how far and which arm, the simulator's reach test can foresee (`foreseen`): such an answer is
+one for planners that see and feel.
 """
 
 from __future__ import annotations
@@ -199,7 +199,8 @@ def run_lesson(
             break
         target, intent = answer
         taught = target.to_text()
-        better = foreseen(session, observation, target, teacher) if corrected < _MOST_FORESEEN else None
+        look_ahead = config.foreseen and corrected < _MOST_FORESEEN
+        better = foreseen(session, observation, target, teacher) if look_ahead else None
         corrected = 0 if better is None else corrected + 1
         target = better or target
         step, origin = target, "teacher"

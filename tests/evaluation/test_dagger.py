@@ -68,7 +68,7 @@ def test_training_keeps_its_threads(request_: DaggerRequest, monkeypatch: pytest
 
 
 def test_lessons_try_what_is_out_of_reach_less_often() -> None:
-    config, tries = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, medium_share=0.0), []
+    config, tries = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, medium_share=0.0, foreseen=True), []
     for index in range(4):
         episode = run_lesson(config, index, None, dagger._Rules())
         tries += [item["feedback"].rpartition(" ")[2] for item in episode.rows[-1]["history"]]

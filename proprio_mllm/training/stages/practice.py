@@ -45,9 +45,9 @@ class PracticeStage:
         shards = pipeline.paths.shards("practice")
         if pipeline.cfg.overwrite:
             shutil.rmtree(shards, ignore_errors=True)
-        written = config_hash(
-            {"key": pipeline.key("words"), "episodes": cfg.episodes, "share": cfg.teacher_share, "version": 2}
-        )
+        ahead = pipeline.cfg.collect.foreseen
+        decides = {"key": pipeline.key("words"), "episodes": cfg.episodes, "share": cfg.teacher_share}
+        written = config_hash(decides | ({"foreseen": True} if ahead else {}))
         request = DaggerRequest(
             student,
             shards,
@@ -56,6 +56,7 @@ class PracticeStage:
             cfg.teacher_share,
             pipeline.cfg.model.image_size,
             written,
+            ahead,
         )
         pipeline.collect_dagger(request, workers=cfg.workers)
         taught, own = lessons.logged(pipeline.paths.shards("lessons")), lessons.logged(shards)
@@ -67,7 +68,8 @@ class PracticeStage:
         save_model(model.eval(), pipeline.paths.model("practice"))
         reader = ShardReader(shards, "demos")
         notes = [json.loads(text) for text in reader.column("privileged")]
-        mine = [note["executed"] == note["taught"] for note in notes if note["origin"] == "student"]
+        told = zip(notes, reader.column("target"), strict=True)  # shards from before there was foresight lack `taught`
+        mine = [note["executed"] == note.get("taught", target) for note, target in told if note["origin"] == "student"]
         return {
             **held_out_metrics(model, {"": lessons.episode, "_logged": taught, "_own": own}),
             "own_steps": float(len(mine)),
