@@ -23,6 +23,7 @@ __all__ = [
     "cache_folder",
     "file_hash",
     "new_folder",
+    "parse_json",
     "read_cached",
     "read_json",
     "write_cached",
@@ -48,6 +49,19 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise DamagedFileError(f"{path}: damaged: {type(value).__name__} in place of an object")
     return value
+
+
+def parse_json(text: str | bytes) -> Any:
+    """JSON as its standard has it.
+
+    Raises:
+        ValueError: on anything else, NaN and infinity included.
+    """
+
+    def refuse(word: str) -> Any:
+        raise ValueError(f"{word} is no JSON number")
+
+    return json.loads(text, parse_constant=refuse)
 
 
 def file_hash(path: Path) -> str:

@@ -7,14 +7,15 @@ has no limit on the time that a request may take to arrive. Paper: none (enginee
 from __future__ import annotations
 
 import contextlib
-import ipaddress
 import select
 import socket
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
-__all__ = ["LimitedHandler", "LimitedServer", "body_length", "has_left", "is_loopback"]
+from configs.schema.checks import is_loopback
+
+__all__ = ["LimitedHandler", "LimitedServer", "body_length", "has_left"]
 
 _FULL: Final = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nRetry-After: 1\r\nConnection: close\r\n\r\n"
 #: Digits of a length that is worth reading.
@@ -73,7 +74,7 @@ class LimitedHandler(BaseHTTPRequestHandler):
         self._watch.start()
         try:
             super().handle_one_request()
-        except (ConnectionError, ValueError):  # the client has gone, or its thread was ended while it was read from
+        except ConnectionError:  # the client has gone
             self.close_connection = True
         finally:
             self._watch.cancel()
@@ -89,6 +90,11 @@ class LimitedHandler(BaseHTTPRequestHandler):
         """The request is there as a whole; from now on it is the answer that takes time."""
         if self._watch is not None:
             self._watch.cancel()
+
+    def is_for_here(self) -> bool:
+        """Whether `Host` names this machine, or nothing: a web page under another name may lead here, and says that name."""
+        host = self.headers.get("Host", "localhost")
+        return is_loopback(host if host.endswith("]") else host.rpartition(":")[0] or host)
 
     def _end(self) -> None:
         self.close_connection = True
@@ -109,13 +115,3 @@ def has_left(connection: socket.socket) -> bool:
         return bool(poll.poll(0)) and connection.recv(1, socket.MSG_PEEK) == b""
     except (OSError, ValueError):  # closed on this side
         return True
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach an interface."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 from urllib.parse import urlsplit
 
-from configs.schema.checks import require, require_used
+from configs.schema.checks import is_loopback, require, require_used
 
 __all__ = ["BackendConfig", "BackendKind"]
 
@@ -100,7 +99,6 @@ class BackendConfig:
     def on_this_machine(self) -> bool:
         """Whether `base_url` names a server of this machine."""
         try:
-            host = urlsplit(self.base_url or "").hostname or ""
-            return host == "localhost" or ipaddress.ip_address(host).is_loopback
+            return is_loopback(urlsplit(self.base_url or "").hostname or "")
         except ValueError:
             return False

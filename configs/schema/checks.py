@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
+import ipaddress
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields
 from typing import Any
 
-__all__ = ["defaults_of", "require", "require_used"]
+__all__ = ["defaults_of", "is_loopback", "require", "require_used"]
 
 
 def require(condition: bool, message: str) -> None:
@@ -42,3 +43,13 @@ def require_used(cfg: Any, of_kinds: Mapping[str, Sequence[str]]) -> None:
             cfg.kind in kinds or value == default,
             f"kind {cfg.kind!r} with {name} {value!r}; allowed: {default!r}, others with {', '.join(kinds)}",
         )
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach an interface."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False

@@ -20,7 +20,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from data.http_limits import LimitedHandler, LimitedServer, body_length, is_loopback
+from data.http_limits import LimitedHandler, LimitedServer, body_length
 from proprio_mllm.backends.protocol import Backend, BackendError, ChatImage, ChatMessage, ChatReply, ChatRequest, RequestError
 
 __all__ = ["ChatServer", "RefusedError", "completion", "model_list", "read_request"]
@@ -168,9 +168,8 @@ class _Handler(LimitedHandler):
         return status, {"error": {"message": message, "type": kind, "param": None, "code": code}}
 
     def _reply(self) -> dict[str, Any]:
-        host = self.headers.get("Host", "localhost")  # browsers always name one
-        if not is_loopback(host if host.endswith("]") else host.rpartition(":")[0] or host):
-            raise RefusedError(f"Host {host[:80]!r} is not this machine", 403)  # a web page under a name that leads here
+        if not self.is_for_here():
+            raise RefusedError(f"Host {self.headers['Host'][:80]!r} is not this machine", 403)
         path = self.path.partition("?")[0]
         if path not in _METHODS:
             raise RefusedError(f"no such path: {path}; allowed: {', '.join(_METHODS)}", 404)

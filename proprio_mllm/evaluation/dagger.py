@@ -99,7 +99,7 @@ def _write(
     for done, (part, rows) in enumerate(_computed(job, missing, config.workers), total - len(missing) + 1):
         writer.write(part, rows)
         progress(done, total)
-    return writer.finish(about)
+    return writer.finish({**about, "foreseen": True} if config.foreseen else about)
 
 
 def _lessons(config: CollectConfig, part: int, student: str | None = None) -> list[dict[str, Any]]:

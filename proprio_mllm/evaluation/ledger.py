@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from configs.validate import ConfigError, build
+from data.files import parse_json
 from data.interface.episode import EpisodeRecord, Outcome
 
 __all__ = ["LEDGER_VERSION", "EpisodeKey", "Ledger", "LedgerError", "key_of", "read_ledger", "scored"]
@@ -30,6 +31,7 @@ _LACKING: Final = {
     LEDGER_VERSION: frozenset(),
 }
 
+#: Fields that are never below 0.
 _COUNTED: Final = (
     "trial", "invalid_output", "steps", "makespan_s", "path_length_m", "arm_utilisation", "planner_calls", "planner_tokens",
     "planner_s", "wall_s", "cached_calls", "reflections",
@@ -89,10 +91,6 @@ def from_json(raw: Mapping[str, Any]) -> EpisodeRecord:
     return record
 
 
-def _no_number(word: str) -> float:
-    raise ValueError(f"{word} is no JSON number")
-
-
 def read_ledger(path: Path) -> list[EpisodeRecord]:
     """Records of a ledger in the order they were written; a last line without an end is left out.
 
@@ -105,7 +103,7 @@ def read_ledger(path: Path) -> list[EpisodeRecord]:
     lines = path.read_bytes().split(b"\n")[:-1]  # what follows the last line end was cut short
     for number, line in enumerate(lines, start=1):
         try:
-            records.append(from_json(json.loads(line, parse_constant=_no_number)))
+            records.append(from_json(parse_json(line)))
         except (ValueError, TypeError, AttributeError) as error:
             raise LedgerError(f"{path}, line {number}: {error}") from error
     return records

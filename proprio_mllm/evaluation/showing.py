@@ -13,13 +13,14 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from configs.schema.eval import BlindName, FeedbackName
 from data.interface.failures import FAILED
 from data.interface.feedback import ActionOutcome, Feedback
 from data.interface.observation import HistoryItem, Observation, Proprioception
 
-__all__ = ["Showing"]
+__all__ = ["Showing", "grey"]
 
 _GREY = 128
 
@@ -39,7 +40,7 @@ class Showing:
     def observation(self, observation: Observation) -> Observation:
         """What the planner sees of an observation."""
         if self.blind in ("image", "both"):
-            observation = dataclasses.replace(observation, image=np.full_like(observation.image, _GREY))
+            observation = dataclasses.replace(observation, image=grey(observation.image))
         if self.blind in ("motion", "both"):
             observation = dataclasses.replace(observation, proprioception=_numb(observation.proprioception))
         if self.feedback == "bit":
@@ -54,6 +55,11 @@ class Showing:
         if self.feedback == "codes":
             return feedback
         return dataclasses.replace(feedback, outcomes=tuple(map(_bit, feedback.outcomes)))
+
+
+def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A picture (H, W, 3) in which nothing is seen."""
+    return np.full_like(image, _GREY)
 
 
 def _numb(body: Proprioception) -> Proprioception:

@@ -9,7 +9,7 @@ The paper gives its prompts in part; the wording here is ours.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 from data.interface.observation import HistoryItem
@@ -23,6 +23,7 @@ __all__ = [
     "critic_prompt",
     "described_motion",
     "filled_motion",
+    "last_steps",
     "looking",
     "made_motion",
     "self_ask_prompt",
@@ -44,9 +45,8 @@ def _system(task: str, style: Style) -> Message:
     return Message("system", _SYSTEM[task][style])
 
 
-def _ids(ids: Iterable[str], style: Style) -> str:
-    listed = list(ids)
-    return "".join(listed) if style == "terse" else (", ".join(listed) or "none")
+def _ids(ids: Sequence[str], style: Style) -> str:
+    return "".join(ids) if style == "terse" else answers(ids)
 
 
 def _body(motion: Sequence[int] | None, style: Style) -> str:
@@ -55,7 +55,8 @@ def _body(motion: Sequence[int] | None, style: Style) -> str:
     return motion_text(motion) if style == "terse" else f"Recent body motion: {motion_text(motion)}\n"
 
 
-def _log(history: Sequence[HistoryItem], last: int, style: Style) -> str:
+def last_steps(history: Sequence[HistoryItem], last: int, style: Style) -> str:
+    """The newest steps of a log with their results, oldest first, a line each."""
     shown = list(history)[-last:] if last else []
     # The feedback repeats the actions with their results; the step alone stands in where there is none.
     lines = [item.feedback or item.step for item in shown]
@@ -141,10 +142,10 @@ def critic_prompt(
 ) -> tuple[Message, ...]:
     """Was the goal completed? The reply is `yes` or `no`."""
     if style == "terse":
-        text = f"{_body(motion, style)}see {_ids(visible, style)}\ndid\n{_log(history, last, style)}\n{goal}?"
+        text = f"{_body(motion, style)}see {_ids(visible, style)}\ndid\n{last_steps(history, last, style)}\n{goal}?"
     else:
         text = (
-            f"{_body(motion, style)}In view: {_ids(visible, style)}\nLog:\n{_log(history, last, style)}\n"
+            f"{_body(motion, style)}In view: {_ids(visible, style)}\nLog:\n{last_steps(history, last, style)}\n"
             f'Was the goal "{goal}" completed? Answer yes or no.'
         )
     return (_system("judge", style), Message("user", text, images=1))
@@ -169,10 +170,10 @@ def self_ask_prompt(
         last: number of earlier steps shown.
     """
     if style == "terse":
-        text = f"{_body(motion, style)}see {_ids(visible, style)}\ndid\n{_log(history, last, style)}\nwhich {relation}?"
+        text = f"{_body(motion, style)}see {_ids(visible, style)}\ndid\n{last_steps(history, last, style)}\nwhich {relation}?"
     else:
         text = (
-            f"{_body(motion, style)}In view: {_ids(visible, style)}\nLog:\n{_log(history, last, style)}\n"
+            f"{_body(motion, style)}In view: {_ids(visible, style)}\nLog:\n{last_steps(history, last, style)}\n"
             f"Which objects are {relation}? List their ids, or say none."
         )
     return (_system("judge", style), Message("user", text, images=1))

@@ -29,19 +29,13 @@ def write_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
         raise OSError(f"{path}: cannot be written: {error}") from error
 
 
-def read_tensors(path: Path, sha256: str | None = None) -> dict[str, Tensor]:
+def read_tensors(path: Path) -> dict[str, Tensor]:
     """Reads a safetensors file.
 
-    Args:
-        path: the file.
-        sha256: checksum that it had when it was written, where that is known.
-
     Raises:
-        DamagedFileError: when it is another one, or no tensors are in it.
+        DamagedFileError: when no tensors are in it.
         FileNotFoundError: when there is no such file.
     """
-    if sha256 is not None and file_hash(path) != sha256:
-        raise DamagedFileError(f"{path}: damaged: its checksum is not the one that it was written with")
     try:
         return load_file(path)
     except SafetensorError as error:

@@ -16,17 +16,17 @@ Paper: none; it says that proprioception helps, this asks what the model knows o
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from configs.arguments import command, read_arguments
@@ -38,9 +38,10 @@ from configs.validate import ConfigError, build
 from data.files import write_text
 from data.interface.bodies import PAPER_ROBOTS
 from data.interface.observation import Proprioception
-from data.motion import HAND_OPENING, OPEN_HAND, PELVIS_HEIGHT
+from data.motion import FPS
 from proprio_mllm.backends.factory import make_backend
 from proprio_mllm.backends.protocol import Backend, ChatMessage, ChatRequest
+from proprio_mllm.evaluation.showing import grey
 from proprio_mllm.model.batch import Example
 from proprio_mllm.model.building import load_model, load_motion
 from proprio_mllm.model.prompts import body_state_prompt, looking
@@ -49,8 +50,8 @@ from proprio_mllm.planners.chat.view import body_text, encoded
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.report.statistics import wilson
 from proprio_mllm.report.table import Table
+from proprio_mllm.training.alignment import body_state
 from proprio_mllm.training.asking import replies
-from proprio_mllm.training.phrases import body_state_words
 from proprio_mllm.training.sources import ViewRow, Views
 from sim.collection.collect import collect
 from sim.scene.rooms import room_names
@@ -61,8 +62,6 @@ __all__ = ["BodyQaConfig", "Question", "Score", "main", "questions_of", "scores"
 _ABOUT_THINGS: Final = ("side", "distance", "height", "arm")
 _ABOUT_SELF: Final = ("hands", "pelvis")
 _KINDS: Final = (*_ABOUT_THINGS, *_ABOUT_SELF)
-_FPS: Final = 20.0
-_GREY: Final = 128
 #: What a model behind a backend may answer, and how it is asked for it.
 _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "side": ("left", "ahead", "right"),
@@ -124,20 +123,24 @@ class Question:
     row: ViewRow
 
 
+#: Answers questions, seeing or blind.
+Answering = Callable[[Sequence[Question], bool], Sequence[str]]
+
+
 @dataclass(frozen=True, slots=True)
 class Score:
     """Right answers to one kind of question.
 
     Attributes:
         kind: the kind, or `all`.
-        count: questions.
+        asked: questions.
         right: right answers.
         commonest: how often the commonest right answer is right.
         blind: right answers without picture and body, None where that was not asked.
     """
 
     kind: str
-    count: int
+    asked: int
     right: int
     commonest: int
     blind: int | None
@@ -157,20 +160,14 @@ def questions_of(views: Views, count: int, seed: int) -> list[Question]:
         for kind in _ABOUT_THINGS:
             for text, answer in views.pairs(row, (kind,), 1, rng):
                 found.append(Question(kind, text.rpartition(" ")[2], answer, row))
-        height = body_state_words(True, True, float(row.motion[-1, PELVIS_HEIGHT]))[1]
-        found += [Question("hands", "", _hands(row.motion), row), Question("pelvis", "", height, row)]
+        hands, height = body_state(row.motion)
+        found += [Question("hands", "", hands, row), Question("pelvis", "", height, row)]
     share = {kind: [one for one in found if one.kind == kind] for kind in _KINDS}
     each = -(-count // len(_KINDS))
     return [one for kind in _KINDS for one in share[kind][:each]][:count]
 
 
-def _hands(motion: NDArray[np.float32]) -> str:
-    """Which hands are open at the end of a motion (T, F), in words."""
-    left, right = (bool(one >= OPEN_HAND) for one in motion[-1, HAND_OPENING])
-    return body_state_words(left, right, 1.0)[0]
-
-
-def scores(asked: Sequence[Question], answer: Callable[[Sequence[Question], bool], Sequence[str]], blind: bool) -> list[Score]:
+def scores(asked: Sequence[Question], answer: Answering, blind: bool) -> list[Score]:
     """Right answers by kind, and of all kinds.
 
     Args:
@@ -192,7 +189,7 @@ def scores(asked: Sequence[Question], answer: Callable[[Sequence[Question], bool
     return found
 
 
-def _stored(folder: str) -> tuple[ModelConfig, Callable[[Sequence[Question], bool], Sequence[str]]]:
+def _stored(folder: str) -> tuple[ModelConfig, Answering]:
     """A stored model's configuration, and how it answers."""
     model = load_model(check_weights(folder, "python train.py stage=all model=tiny release=weights"))
     tokens = load_motion(folder) if model.cfg.proprioception else None
@@ -204,12 +201,12 @@ def _stored(folder: str) -> tuple[ModelConfig, Callable[[Sequence[Question], boo
         motion = np.zeros_like(one.row.motion) if blind else one.row.motion
         codes = None if tokens is None else tokens.encode_window(motion)
         if one.kind in _ABOUT_SELF:
-            hands = "" if one.kind == "hands" else _hands(motion)
+            hands = "" if one.kind == "hands" else body_state(motion)[0]
             return Example(body_state_prompt([] if codes is None else codes, hands, "", style))
         view = one.row.view
         if blind:
             assert view.key_bodies is not None
-            view = replace(view, image=np.full_like(view.image, _GREY), key_bodies=np.zeros_like(view.key_bodies))
+            view = replace(view, image=grey(view.image), key_bodies=np.zeros_like(view.key_bodies))
         return Example(looking([(ask(one.kind, one.thing, style), "")], codes, style), (view,))
 
     def answer(asked: Sequence[Question], blind: bool) -> list[str]:
@@ -221,7 +218,7 @@ def _stored(folder: str) -> tuple[ModelConfig, Callable[[Sequence[Question], boo
     return model.cfg, answer
 
 
-def _chatting(backend: Backend, body: bool) -> Callable[[Sequence[Question], bool], Sequence[str]]:
+def _chatting(backend: Backend, body: bool) -> Answering:
     """How a model behind a backend answers."""
 
     def request(one: Question, blind: bool) -> ChatRequest:
@@ -246,7 +243,7 @@ def _chatting(backend: Backend, body: bool) -> Callable[[Sequence[Question], boo
 
 def _felt(row: ViewRow) -> Proprioception:
     assert row.view.key_bodies is not None
-    return Proprioception(row.motion, _FPS, np.zeros(0), np.asarray(row.view.key_bodies, dtype=np.float64))
+    return Proprioception(row.motion, FPS, np.zeros(0), np.asarray(row.view.key_bodies, dtype=np.float64))
 
 
 def _read(kind: str, text: str) -> str:
@@ -263,30 +260,19 @@ def _read(kind: str, text: str) -> str:
 def _table(title: str, found: Sequence[Score]) -> Table:
     rows = []
     for one in found:
-        low, high = wilson(one.right, one.count)
+        low, high = wilson(one.right, one.asked)
         cells = [
-            f"{100 * one.right / one.count:.1f} [{100 * low:.1f}, {100 * high:.1f}]",
-            f"{100 * one.commonest / one.count:.1f}",
+            f"{100 * one.right / one.asked:.1f} [{100 * low:.1f}, {100 * high:.1f}]",
+            f"{100 * one.commonest / one.asked:.1f}",
         ]
-        cells.append("" if one.blind is None else f"{100 * one.blind / one.count:.1f}")
-        rows.append((one.kind, str(one.count), *cells))
+        cells.append("" if one.blind is None else f"{100 * one.blind / one.asked:.1f}")
+        rows.append((one.kind, str(one.asked), *cells))
     return Table(title, ("question", "asked", "right %, 95 % interval", "commonest answer %", "blind %"), tuple(rows))
 
 
-@command()
-def main(arguments: Sequence[str]) -> int:
-    """Draws the views unless they are there, asks, prints the table and writes it beside them."""
-    cfg = read_arguments(BodyQaConfig, arguments)
-    rooms = tuple(name for name in room_names() if name not in TRAIN_ROOMS)
-    backend_cfg = None if cfg.backend is None else build(BackendConfig, group_file("backend", cfg.backend), "backend")
-    if cfg.weights is not None:
-        model, answer = _stored(cfg.weights)
-        name, size = Path(cfg.weights).resolve().name, model.image_size
-    else:
-        assert backend_cfg is not None
-        model = ModelConfig("asked")
-        name, size = backend_cfg.name, backend_cfg.image_size
-        answer = _chatting(make_backend(backend_cfg, None), cfg.body)
+def _run(cfg: BodyQaConfig, name: str, size: int, model: ModelConfig, answer: Answering) -> None:
+    """Asks on views of a size, which are drawn unless they are there; prints the table and writes it."""
+    rooms = tuple(room for room in room_names() if room not in TRAIN_ROOMS)
     count = -(-cfg.questions // len(_KINDS))
     folder = Path(cfg.out) / f"views-{size}-{count}-{cfg.seed}-{'-'.join(cfg.robots)}"
     sys.stdout.write(f"{cfg.questions} questions on {', '.join(rooms)}\n")
@@ -298,10 +284,24 @@ def main(arguments: Sequence[str]) -> int:
     found = scores(questions_of(views, cfg.questions, cfg.seed), answer, cfg.blind)
     table = _table(f"BodyQA: {name}, {', '.join(cfg.robots)}, seed {cfg.seed}", found)
     table.show()
-    record = {"model": name, "seed": cfg.seed, "robots": list(cfg.robots), "rooms": list(rooms), "body": cfg.body}
-    record["scores"] = {
-        one.kind: {"asked": one.count, "right": one.right, "commonest": one.commonest, "blind": one.blind} for one in found
-    }
+    record = {
+        "model": name, "seed": cfg.seed, "robots": cfg.robots, "rooms": rooms, "body": cfg.body,
+        "scores": {one.kind: asdict(one) for one in found},
+    }  # fmt: skip
     write_text(Path(cfg.out) / f"{name}.json", json.dumps(record, indent=1) + "\n")
     write_text(Path(cfg.out) / f"{name}.md", table.to_markdown())
+
+
+@command()
+def main(arguments: Sequence[str]) -> int:
+    """Asks a stored model, or one behind a backend."""
+    cfg = read_arguments(BodyQaConfig, arguments)
+    if cfg.backend is None:
+        assert cfg.weights is not None
+        model, answer = _stored(cfg.weights)
+        _run(cfg, Path(cfg.weights).resolve().name, model.image_size, model, answer)
+        return 0
+    backend = build(BackendConfig, group_file("backend", cfg.backend), "backend")
+    with contextlib.closing(make_backend(backend, None)) as asked:
+        _run(cfg, backend.name, backend.image_size, ModelConfig("asked"), _chatting(asked, cfg.body))
     return 0

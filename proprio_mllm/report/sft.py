@@ -28,7 +28,7 @@ from data.interface.observation import HistoryItem, Observation
 from data.shards import encode_png
 from proprio_mllm.evaluation.pool import run_jobs
 from proprio_mllm.model.chat import Message, to_chat
-from proprio_mllm.model.prompts import with_answer
+from proprio_mllm.model.prompts import answers, last_steps, with_answer
 from proprio_mllm.report.frames import episode_id
 from proprio_mllm.report.reenact import Episode, Moment, Reenactment
 
@@ -94,15 +94,12 @@ def plan_prompt(
         f"You plan for a dual-arm humanoid household robot. Reply with the next step only.\n{action_manual()}\n{code_manual()}"
     )
     elsewhere = [name for name in known if name not in set(visible)]
-    # The feedback repeats the actions with their results; the step alone stands in where there is none.
-    log = [item.feedback or item.step for item in list(history)[-last:]] if last else []
     lines = (
         f"Robot: {robot}. Step {step + 1} of {time_limit}.",
         f"Task: {instruction}",
-        f"In view: {', '.join(visible) or 'none'}",
-        f"Known elsewhere: {', '.join(elsewhere) or 'none'}",
-        "Last steps:",
-        *(log or ["nothing yet"]),
+        f"In view: {answers(visible)}",
+        f"Known elsewhere: {answers(elsewhere)}",
+        f"Last steps:\n{last_steps(history, last, 'full')}",
         "Next step?",
     )
     return Message("system", system), Message("user", "\n".join(lines), 1)

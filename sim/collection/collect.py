@@ -33,8 +33,8 @@ _LOG = logging.getLogger(__name__)
 _VERSION = {"views": 2, "demos": 3}
 #: Fields that do not change what is written.
 _UNKEYED = {
-    "views": ("out", "workers", "noise", "medium_share"),
-    "demos": ("out", "workers", "views_per_world"),
+    "views": ("out", "workers", "noise", "medium_share", "foreseen"),
+    "demos": ("out", "workers", "views_per_world", "foreseen"),
 }
 
 
@@ -65,7 +65,7 @@ def collect(config: CollectConfig, progress: Callable[[int, int], None] | None =
     Raises:
         data.shards.ShardError: when the folder holds something else and `overwrite` is off.
     """
-    keyed = {k: v for k, v in dataclasses.asdict(config).items() if k not in (*_UNKEYED[config.kind], "foreseen")} | {
+    keyed = {k: v for k, v in dataclasses.asdict(config).items() if k not in _UNKEYED[config.kind]} | {
         "version": _VERSION[config.kind]
     }
     writer = ShardWriter(Path(config.out), config.kind, config_hash(keyed), overwrite)

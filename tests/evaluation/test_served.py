@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from transformers import AutoTokenizer
 
 from configs.compose import compose
 from configs.schema.backend import BackendConfig
@@ -23,8 +26,12 @@ TINY = Path(__file__).resolve().parents[2] / "weights/tiny/base"
 
 
 @pytest.fixture(scope="module")
-def url() -> Iterator[str]:
-    chat = LocalChat(BackendConfig("local", "served", model=str(TINY), device="cpu", batch=4, cache=None))
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The tiny model, held to replies of one word: it was shown no such prompt, and would go on for ever."""
+    folder = shutil.copytree(TINY, tmp_path_factory.mktemp("served") / "base")
+    ends = list(range(len(AutoTokenizer.from_pretrained(folder / "processor"))))
+    (folder / "vlm" / "generation_config.json").write_text(json.dumps({"eos_token_id": ends}), encoding="utf-8")
+    chat = LocalChat(BackendConfig("local", "served", model=str(folder), device="cpu", batch=4, cache=None))
     server = ChatServer(chat, "base", 0, False, chat.revision)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield server.url

@@ -66,7 +66,7 @@ def test_scores_by_kind_and_of_all(asked: list[Question]) -> None:
 
     found = scores(asked, answer, blind=True)
     assert [one.kind for one in found] == ["side", "distance", "height", "arm", "hands", "pelvis", "all"]
-    assert all(one.right == one.count for one in found) and found[-1].count == len(asked) == sum(o.count for o in found[:-1])
+    assert all(one.right == one.asked for one in found) and found[-1].asked == len(asked) == sum(o.asked for o in found[:-1])
     assert found[0].blind == sum(one.answer == "left" for one in asked if one.kind == "side")
     assert found[-1].commonest == sum(one.commonest for one in found[:-1]) < len(asked)
     assert scores(asked, answer, blind=False)[0].blind is None
@@ -75,7 +75,7 @@ def test_scores_by_kind_and_of_all(asked: list[Question]) -> None:
 def test_a_backend_is_shown_picture_and_body_or_neither(asked: list[Question]) -> None:
     backend = _Told()
     found = {one.kind: one for one in scores(asked, _chatting(backend, True), blind=True)}
-    assert found["pelvis"].right == found["pelvis"].count and found["hands"].right == found["hands"].count
+    assert found["pelvis"].right == found["pelvis"].asked and found["hands"].right == found["hands"].asked
     assert found["side"].right == 0 and found["pelvis"].blind == 0
     pictures = [any(isinstance(part, ChatImage) for part in one.messages[-1].content) for one in backend.requests]
     assert pictures == [True] * len(asked) + [False] * len(asked)

@@ -11,7 +11,7 @@ import urllib.request
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from data.http_limits import is_loopback
+from configs.schema.checks import is_loopback
 from sim.interfaces.controller import Event, Stopped
 from sim.interfaces.remote.protocol import IMAGES, decode_event, dumps
 

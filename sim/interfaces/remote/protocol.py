@@ -12,6 +12,7 @@ import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
+from data.files import parse_json
 from sim.interfaces.controller import Event
 
 __all__ = ["IMAGES", "VERSION", "ProtocolError", "decode_event", "dumps", "encode_event", "images_of", "loads"]
@@ -31,14 +32,8 @@ def loads(text: bytes) -> dict[str, Any]:
     Raises:
         ProtocolError: on anything else, NaN and infinity included.
     """
-
-    def refuse(word: str) -> Any:
-        raise ProtocolError(f"{word} is no JSON number")
-
     try:
-        value = json.loads(text.decode("utf-8"), parse_constant=refuse)
-    except ProtocolError:
-        raise
+        value = parse_json(text.decode("utf-8"))
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits too
         raise ProtocolError(f"the body is no JSON: {error}") from None
     if not isinstance(value, dict):

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any, Final
 
-from data.http_limits import LimitedHandler, LimitedServer, body_length, has_left, is_loopback
+from configs.schema.checks import is_loopback
+from data.http_limits import LimitedHandler, LimitedServer, body_length, has_left
 from data.interface.bodies import DEFAULT_ROBOT
 from sim.interfaces.remote.protocol import VERSION, ProtocolError, dumps, images_of, loads
 from sim.interfaces.remote.worlds import (
@@ -200,9 +201,8 @@ class _Handler(LimitedHandler):
             return None
 
     def _allowed(self) -> bool:
-        host = self.headers.get("Host", "").rsplit(":", 1)[0]
-        if self.loopback and not is_loopback(host):
-            self._fail(HTTPStatus.FORBIDDEN, f"Host {host[:80]!r} is not this machine")
+        if self.loopback and not self.is_for_here():
+            self._fail(HTTPStatus.FORBIDDEN, f"Host {self.headers['Host'][:80]!r} is not this machine")
             return False
         if self.token is not None:
             scheme, _, shown = self.headers.get("Authorization", "").partition(" ")

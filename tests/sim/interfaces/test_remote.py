@@ -16,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from data.http_limits import is_loopback
+from configs.schema.checks import is_loopback
 from sim.interfaces.controller import Controller
 from sim.interfaces.remote.client import RemoteController, RemoteError
 from sim.interfaces.remote.protocol import ProtocolError, loads
