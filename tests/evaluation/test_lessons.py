@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -71,6 +72,22 @@ def test_some_logs_are_held_out(logs: Path, monkeypatch: pytest.MonkeyPatch) -> 
     said = dict(zip(reader.column("episode"), reader.column("instruction"), strict=True))
     apart = [name for name in said if held_out(name)] or list(said)[:1]
     assert others == {text_words(said[name])[:3] for name in apart}
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_what_was_foreseen_is_the_answer_with_a_picture_and_never_in_words_alone(
+    ahead: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lessons, "_RENAMED", 0.0)
+    collect_lessons(CollectConfig("demos", str(tmp_path), 2, seed=3, image_size=28, part_size=10, foreseen=ahead))
+    reader = ShardReader(tmp_path, "demos")
+    taught = [json.loads(text)["taught"] for text in reader.column("privileged")]
+    targets = reader.column("target")
+    told = [_step(turn.answer) for episode in Lessons().told(tmp_path) for turn in episode.turns]
+    assert told == [_step(answer_words("Pick", "", PlanStep.parse(target))) for target in targets]
+    assert (targets != taught) == ahead == bool(reader.manifest.metadata.get("foreseen"))
+    alone = [_step(turn.answer) for turn in Lessons().logged(tmp_path)(-1).turns]
+    assert all(step in [_step(answer_words("Pick", "", PlanStep.parse(text))) for text in taught] for step in alone)
 
 
 def _step(answer: Sequence[str]) -> tuple[str, ...]:
