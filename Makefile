@@ -11,7 +11,7 @@ export WANDB_MODE ?= offline
 # Model weights come from this repository or from a path you give, never from a hub.
 export HF_HUB_OFFLINE ?= 1
 XDIST := -n auto --maxprocesses=4 --dist=worksteal
-QUICK := tests/configs tests/data/interface tests/model tests/planners tests/report \
+QUICK := tests/configs tests/interface tests/model tests/planners tests/report \
   $(addprefix --ignore=tests/,$(addprefix report/test_,export.py figures.py notebook.py reconstruction.py tokenizer.py video.py) \
   $(addprefix planners/,chat/dag_plan/test_episode.py scripted/test_planner.py test_released.py))
 

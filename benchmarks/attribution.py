@@ -25,8 +25,8 @@ from rich.progress import Progress
 from benchmarks.fault_episodes import Cell, CellRunner, ScriptedResult, cells
 from configs.arguments import command, read_arguments
 from data.files import write_text
-from data.interface.episode import Outcome
-from data.interface.failures import FailureCategory
+from interface.episode import Outcome
+from interface.failures import FailureCategory
 from proprio_mllm.evaluation.pool import run_jobs
 from proprio_mllm.report.statistics import wilson
 from proprio_mllm.report.summary import write_json

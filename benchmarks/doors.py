@@ -17,9 +17,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from data.interface.bodies import Arm
-from data.interface.feedback import ActionOutcome
-from data.interface.steps import Action, PlanStep
+from interface.bodies import Arm
+from interface.feedback import ActionOutcome
+from interface.steps import Action, PlanStep
 from sim.scene.catalogue import MovingSpec
 from sim.scene.rooms import room_names
 from sim.session.session import FreePlay, Session

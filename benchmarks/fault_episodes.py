@@ -18,10 +18,10 @@ import numpy as np
 
 from benchmarks.fault_injection import CAUSES, LATE_SLIPS, SLIPS, Cause, FaultyPlanner
 from configs.schema.robot import RobotConfig
-from data.interface.actions import ACTIONS, ActionKind
-from data.interface.episode import EpisodeRecord, Outcome
-from data.interface.failures import FailureCategory
-from data.interface.steps import PlanStep
+from interface.actions import ACTIONS, ActionKind
+from interface.episode import EpisodeRecord, Outcome
+from interface.failures import FailureCategory
+from interface.steps import PlanStep
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, Limits, RunnableSession, run_episode
 from proprio_mllm.evaluation.seeds import episode_seed, stream
 from proprio_mllm.evaluation.sessions import open_session

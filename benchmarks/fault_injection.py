@@ -25,12 +25,12 @@ from typing import Final
 
 import numpy as np
 
-from data.interface.actions import ActionKind
-from data.interface.bodies import Arm
-from data.interface.failures import FailureCategory
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
-from data.interface.steps import Action, PlanStep
+from interface.actions import ActionKind
+from interface.bodies import Arm
+from interface.failures import FailureCategory
+from interface.feedback import Feedback
+from interface.observation import Observation
+from interface.steps import Action, PlanStep
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, parse_reply
 from sim.expert.expert import Expert
 from sim.session.session import Session

@@ -21,12 +21,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from configs.arguments import command, read_arguments
 from configs.validate import ConfigError
-from data.interface.actions import ACTIONS, ActionKind
-from data.interface.failures import FAILURES
 from data.workers import worker_pool
+from interface.actions import ACTIONS, ActionKind
+from interface.failures import FAILURES
+from robots.spec import available_robots
 from sim.interfaces.aliases import ALIASES
 from sim.interfaces.controller import Controller, Event
-from sim.robots.spec import available_robots
 from sim.scene.rooms import room_names
 
 __all__ = ["FuzzConfig", "Tally", "calls", "check", "fuzz", "main"]

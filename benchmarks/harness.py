@@ -26,9 +26,9 @@ import numpy as np
 import sim.tasks  # noqa: F401  # chooses the OpenGL backend before anything draws
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
-from data.interface.steps import PlanStep
+from interface.feedback import Feedback
+from interface.observation import Observation
+from interface.steps import PlanStep
 from proprio_mllm.evaluation.episode import GoalReport, RunnableSession, Stats
 from proprio_mllm.evaluation.run import EvalRun, evaluate
 from proprio_mllm.evaluation.sessions import open_session

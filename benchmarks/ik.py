@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from data.interface.bodies import SIDES
-from sim.robots.build_solver import SOLVERS, RobotKit, robot_kit
-from sim.robots.kinematics import root_quaternion
-from sim.robots.reach import reach_over_heights
-from sim.robots.self_collision import SELF_TOUCH_M
-from sim.robots.solver import ArmSolver, IkResult, ReachTarget, rotation_from_axes
-from sim.robots.spec import available_robots
+from interface.bodies import SIDES
+from robots.build_solver import SOLVERS, RobotKit, robot_kit
+from robots.kinematics import root_quaternion
+from robots.reach import reach_over_heights
+from robots.self_collision import SELF_TOUCH_M
+from robots.solver import ArmSolver, IkResult, ReachTarget, rotation_from_axes
+from robots.spec import available_robots
 
 #: The grid: shares of the arm's reach ahead of the pelvis, metres left of it (right for the right arm), shares of the reach
 #: above the shoulder.

@@ -20,8 +20,8 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from data.interface.actions import ActionKind
-from data.interface.steps import Action, PlanStep
+from interface.actions import ActionKind
+from interface.steps import Action, PlanStep
 from proprio_mllm.backends.protocol import ChatReply, ChatRequest
 from sim.benchmark.certificates import load_certificates
 from sim.tasks.task import load_benchmark

@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 
 from configs.arguments import command, read_arguments
-from data.interface.bodies import PAPER_ROBOTS
 from data.workers import worker_pool
+from interface.bodies import PAPER_ROBOTS
 from proprio_mllm.report.statistics import wilson
 from sim.expert.expert import Expert
 from sim.session.session import Session

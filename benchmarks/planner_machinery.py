@@ -28,11 +28,11 @@ import sim.tasks  # noqa: F401  # chooses the OpenGL backend before anything dra
 from configs.compose import compose
 from configs.schema.eval import EvalConfig
 from configs.validate import build
-from data.interface.episode import EpisodeRecord, Outcome
+from interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.planners.memory import MemoryFileError, check_memory
+from robots.spec import available_robots
 from sim.benchmark.certificates import load_certificates
-from sim.robots.spec import available_robots
 from sim.tasks.task import Task, load_benchmark, write_tasks
 
 SCRIPT = Path(__file__).with_name("imperfect_expert.py")

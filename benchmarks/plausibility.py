@@ -23,8 +23,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import PAPER_ROBOTS, SIDES
-from data.interface.steps import PlanStep
+from interface.bodies import PAPER_ROBOTS, SIDES
+from interface.steps import PlanStep
 from sim.benchmark.certificates import load_certificates
 from sim.session.session import Session
 from sim.tasks.task import load_benchmark

@@ -50,15 +50,15 @@ from retargeters.exchange import Array, Clip, Job, Outcome, Results
 
 from data.contacts import toe_contacts
 from data.generator import GENERATOR_VERSION, generate_clip
-from data.interface.bodies import SIDES
 from data.metrics import Metrics, evaluate_joints
 from data.motion import FPS
 from data.omomo import find_demo_clips, load_omomo
 from data.retarget import Retargeter
 from data.skeleton import JOINTS, HumanMotion, index
 from data.targets import make_targets
-from sim.robots.leg_ik import crouch
-from sim.robots.spec import load_robot
+from interface.bodies import SIDES
+from robots.leg_ik import crouch
+from robots.spec import load_robot
 
 SCRIPTS: Final = Path(__file__).parent / "retargeters"
 OURS, MINK, HOLOSOMA = "ours", "mink (GMR)", "holosoma"

@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from data.interface.actions import ACTIONS, ActionKind
-from data.interface.steps import PlanStep
 from data.shards import ShardError, ShardReader, decode_png
+from interface.actions import ACTIONS, ActionKind
+from interface.steps import PlanStep
 from proprio_mllm.planners.chat.embedding import SentenceEmbedder
 from proprio_mllm.planners.chat.recall import Key, MomentRecall, TaskRecall, load_moments
 from proprio_mllm.planners.chat.sight import ImageEncoder

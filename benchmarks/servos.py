@@ -15,8 +15,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from data.interface.bodies import SIDES
-from sim.robots.spec import RobotSpec, available_robots, load_robot
+from interface.bodies import SIDES
+from robots.spec import RobotSpec, available_robots, load_robot
 from sim.scene.compiler import BASE_JOINTS, TIMESTEP_S
 from sim.world.world import World
 

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 
 import sim.tasks
-from data.interface.steps import PlanStep
-from sim.robots.spec import load_robot
+from interface.steps import PlanStep
+from robots.spec import load_robot
 from sim.scene.compiler import build_spec
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
@@ -206,7 +206,7 @@ def camera_frames(size: int = 256) -> dict[str, float]:
 def memory() -> dict[str, float]:
     """Unshared and shared resident memory of a process with one environment, megabytes."""
     code = (
-        "from sim.session.session import Session, FreePlay\nfrom data.interface.steps import PlanStep\n"
+        "from sim.session.session import Session, FreePlay\nfrom interface.steps import PlanStep\n"
         "s = Session('h1', image_size=224)\ns.reset(FreePlay('kitchen_1'), 0)\n"
         "for t in ('GoTo(Bottle_1)', 'Pick(left, Bottle_1)'): s.step(PlanStep.parse(t))\n"
         "rows = dict(l.split(':') for l in open('/proc/self/smaps_rollup').read().splitlines()[1:])\n"

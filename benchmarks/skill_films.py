@@ -17,9 +17,9 @@ import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.failures import FailureCode
-from data.interface.steps import PlanStep
-from sim.robots.spec import available_robots
+from interface.failures import FailureCode
+from interface.steps import PlanStep
+from robots.spec import available_robots
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 from sim.tools.video import VideoRecorder

@@ -17,7 +17,7 @@ from pathlib import Path
 from configs.arguments import command, read_arguments
 from configs.schema.eval import EvalConfig
 from configs.validate import build
-from data.interface.episode import Outcome
+from interface.episode import Outcome
 from proprio_mllm.evaluation.run import evaluate, select_tasks
 from proprio_mllm.report.runs import load_run
 from sim.tasks.task import write_tasks

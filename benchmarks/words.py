@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from configs.arguments import command, read_arguments
-from data.interface.steps import PlanStep
+from interface.steps import PlanStep
 from proprio_mllm.evaluation.lessons import WordsOnly
 from proprio_mllm.planners.protocol import TaskInfo
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner

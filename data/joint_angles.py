@@ -14,12 +14,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from data.interface.bodies import KEY_BODIES, SIDES
 from data.least_squares import BoundedSearch
 from data.motion import HAND_OPENING, PELVIS_HEIGHT, decode_key_bodies, decode_root
-from sim.robots.kinematics import RobotModel
-from sim.robots.leg_ik import crouch
-from sim.robots.spec import RobotSpec
+from interface.bodies import KEY_BODIES, SIDES
+from robots.kinematics import RobotModel
+from robots.leg_ik import crouch
+from robots.spec import RobotSpec
 
 __all__ = ["JointAngles"]
 

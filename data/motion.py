@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from data.interface.bodies import KEY_BODIES
+from interface.bodies import KEY_BODIES
 
 __all__ = [
     "FEATURES",
@@ -115,7 +115,7 @@ def encode_frames(
 
     Args:
         root_pose: (T, 7) pelvis position (m) and unit quaternion (w, x, y, z) in the world.
-        key_bodies_world: (T, K, 3) metres, in the order of `data.interface.bodies.KEY_BODIES`.
+        key_bodies_world: (T, K, 3) metres, in the order of `interface.bodies.KEY_BODIES`.
         hand_opening: (T, 2) left and right, 0 closed to 1 open.
         fps: frames per second.
 

@@ -25,14 +25,14 @@ from data.cluster import ray_instance
 from data.filter import admit, gate, reason_group
 from data.generator import GENERATOR_VERSION, write_dataset
 from data.humanml3d import DatasetError
-from data.interface.motion import Motion
 from data.metrics import Metrics, evaluate
 from data.motion import FPS
 from data.retarget import Retargeter
 from data.shards import Manifest, ShardWriter, config_hash
 from data.sources import clip_ids, read_clip
 from data.workers import worker_pool
-from sim.robots.spec import load_robot
+from interface.motion import Motion
+from robots.spec import load_robot
 
 __all__ = ["PartResult", "Pictures", "Replay", "build_clips", "dataset_folder", "part_of_clips"]
 

@@ -17,11 +17,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from data.interface.bodies import SIDES
 from data.least_squares import System
 from data.targets import Targets
-from sim.robots.kinematics import RobotModel
-from sim.robots.self_collision import close_rows, default_shapes, moved_by, solid_on
+from interface.bodies import SIDES
+from robots.kinematics import RobotModel
+from robots.self_collision import close_rows, default_shapes, moved_by, solid_on
 
 __all__ = ["BodyFrames", "Residuals"]
 
@@ -161,7 +161,7 @@ def _combination() -> Array:
 class _Apart:
     """Residuals of parts of a robot that come too close: arms to the rest and to each other, legs to each other.
 
-    The arms' shapes are those of `sim.robots.self_collision`, with the hands' neighbours there counted here; shins and feet,
+    The arms' shapes are those of `robots.self_collision`, with the hands' neighbours there counted here; shins and feet,
     which nothing else needs, are capsules around the description's geoms.
     """
 

@@ -23,17 +23,17 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from data.interface.bodies import KEY_BODIES
-from data.interface.motion import Motion
 from data.least_squares import BoundedSearch, System
 from data.motion import FPS, encode_frames, resample
 from data.residuals import BodyFrames, Residuals
 from data.self_contact import SelfContact
 from data.skeleton import HumanMotion
 from data.targets import Measures, Targets, make_targets
-from sim.robots.kinematics import RobotModel
-from sim.robots.leg_ik import crouch
-from sim.robots.spec import RobotSpec
+from interface.bodies import KEY_BODIES
+from interface.motion import Motion
+from robots.kinematics import RobotModel
+from robots.leg_ik import crouch
+from robots.spec import RobotSpec
 
 __all__ = ["MAX_JOINT_VELOCITY", "Measured", "Retargeted", "Retargeter"]
 

@@ -26,7 +26,7 @@ from data.omomo import find_demo_clips, level_parts, load_mocap, load_omomo
 from data.retarget import Retargeter
 from data.skeleton import HumanMotion
 from data.tracking import Tracker, Tracking
-from sim.robots.spec import available_robots, load_robot
+from robots.spec import available_robots, load_robot
 
 __all__ = ["PHYSICS", "TARGETS", "Column", "main", "measure", "table"]
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import KEY_BODIES, SIDES
-from sim.robots.kinematics import RobotModel
-from sim.robots.spec import RobotSpec, load_robot
+from interface.bodies import KEY_BODIES, SIDES
+from robots.kinematics import RobotModel
+from robots.spec import RobotSpec, load_robot
 
 __all__ = ["RobotFacts", "robot_facts"]
 

@@ -1,6 +1,6 @@
 """How deep a robot's posture presses it into itself, by MuJoCo's collision test on the primitive shapes of its own description.
 
-It measures what `data.retarget` avoids with other shapes (`sim.robots.self_collision`), so that the measure is not the
+It measures what `data.retarget` avoids with other shapes (`robots.self_collision`), so that the measure is not the
 method's own. Neighbours do not count: bodies with at most two joints between them, a thigh and the pelvis, parts of one hand,
 and pairs that overlap in the standing posture.
 
@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robots.kinematics import RobotModel
-from sim.robots.leg_ik import crouch
+from robots.kinematics import RobotModel
+from robots.leg_ik import crouch
 
 __all__ = ["DEEP_M", "SelfContact"]
 

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from data.interface.motion import Motion
-from sim.robots.kinematics import RobotModel
+from interface.motion import Motion
+from robots.kinematics import RobotModel
 
 __all__ = ["FAILED_M", "Tracked", "Tracker", "Tracking"]
 

@@ -5,8 +5,8 @@ It walks to something that its instruction names, and picks it up. Copy it, and 
 
 import numpy as np
 
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
+from interface.feedback import Feedback
+from interface.observation import Observation
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, parse_reply
 
 

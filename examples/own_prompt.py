@@ -10,9 +10,9 @@ failures of the server are no scores. Copy it, and write a prompt of your own. A
 import numpy as np
 from pydantic import BaseModel
 
-from data.interface.feedback import Feedback
-from data.interface.manual import action_manual
-from data.interface.observation import Observation
+from interface.feedback import Feedback
+from interface.manual import action_manual
+from interface.observation import Observation
 from proprio_mllm.backends.protocol import Backend
 from proprio_mllm.planners.chat.asking import Asker
 from proprio_mllm.planners.chat.options import ChatOptions

@@ -1,5 +1,3 @@
-"""DualTHOR re-founded on MuJoCo: robots, rooms, skills, tasks, and the privileged expert."""
+"""DualTHOR re-founded on MuJoCo: rooms, skills, tasks, and the privileged expert."""
 
-from sim.gl import select_backend as _select_backend
-
-_select_backend()
+import robots as _robots  # noqa: F401  # chooses the OpenGL backend

@@ -14,9 +14,9 @@ from configs.compose import compose
 from configs.schema.eval import EvalConfig
 from configs.schema.train import TrainConfig
 from configs.validate import build
-from data.interface.actions import ACTIONS
-from data.interface.bodies import PAPER_ROBOTS
-from data.interface.failures import FAILURES
+from interface.actions import ACTIONS
+from interface.bodies import PAPER_ROBOTS
+from interface.failures import FAILURES
 from proprio_mllm.planners.file_planner import load_planner
 from proprio_mllm.planners.protocol import TaskInfo
 from sim.session.session import Session

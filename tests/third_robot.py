@@ -6,7 +6,7 @@ from pathlib import Path
 
 import yaml
 
-from sim.robots.spec import load_robot
+from robots.spec import load_robot
 
 
 def write_third_robot(folder: Path) -> None:

@@ -1,12 +1,12 @@
-"""Makes the robots' MJCF under `sim/robots/assets/` again: `python tools/build_robots.py [h1|x1] [--menagerie DIR]`."""
+"""Makes the robots' MJCF under `robots/assets/` again: `python tools/build_robots.py [h1|x1] [--menagerie DIR]`."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from sim.robots.build import ASSETS, find_menagerie
-from sim.robots.build_x1 import build_x1
+from robots.build import ASSETS, find_menagerie
+from robots.build_x1 import build_x1
 
 
 def main() -> None:
@@ -20,7 +20,7 @@ def main() -> None:
         if robot == "x1":
             build_x1(ASSETS / "x1_kinematics.csv", args.target / "x1")
         elif robot == "h1":
-            from sim.robots.build_h1 import build_h1  # needs the `assets` extra
+            from robots.build_h1 import build_h1  # needs the `assets` extra
 
             build_h1(args.menagerie or find_menagerie(), ASSETS / "h1_kinematics.csv", args.target / "h1")
         else:

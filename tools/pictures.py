@@ -12,7 +12,7 @@ from pathlib import Path
 import imageio.v3 as iio
 from PIL import Image
 
-from sim.robots.spec import load_robot
+from robots.spec import load_robot
 from sim.tools.look import robot_poses, room_sheet
 from sim.tools.video import VideoConfig, film
 from sim.world.world import World

@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("configs", "data", "sim", "proprio_mllm")
+PACKAGES = ("configs", "interface", "robots", "data", "sim", "proprio_mllm")
 
 
 def modules_of(root: Path) -> dict[str, Path]:
@@ -91,10 +91,10 @@ def foreign(root: Path) -> Iterator[str]:
         for other in sorted(imports_of(tree, name, modules)):
             if not within(other, [home, *allowed[home]]):
                 yield f"{name} imports {other}; {home} may import {', '.join(allowed[home]) or 'nothing'}"
-        if home == "data.interface":
+        if home == "interface":
             outside = {node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
             outside |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-            for other in sorted({one.split(".")[0] for one in outside} - set(sys.stdlib_module_names) - {"data", "numpy"}):
+            for other in sorted({one.split(".")[0] for one in outside} - set(sys.stdlib_module_names) - {"interface", "numpy"}):
                 yield f"{name} imports {other}; the interface needs numpy and the standard library alone"
 
 

@@ -12,9 +12,9 @@ ASSETS = """# Third-party material
 
 | what | from | licence |
 |---|---|---|
-| `sim/robots/assets/h1/` (kinematics, simplified meshes) | google-deepmind/mujoco_menagerie `unitree_h1` | BSD-3-Clause |
-| `sim/robots/assets/h1_kinematics.csv` (hands of `h1_with_hand.urdf`) | unitreerobotics/unitree_ros | BSD-3-Clause |
-| `sim/robots/assets/x1_kinematics.csv` (kinematics; geometry is ours) | AgibotTech/agibot_x1_infer | Mulan PSL v2 |
+| `robots/assets/h1/` (kinematics, simplified meshes) | google-deepmind/mujoco_menagerie `unitree_h1` | BSD-3-Clause |
+| `robots/assets/h1_kinematics.csv` (hands of `h1_with_hand.urdf`) | unitreerobotics/unitree_ros | BSD-3-Clause |
+| `robots/assets/x1_kinematics.csv` (kinematics; geometry is ours) | AgibotTech/agibot_x1_infer | Mulan PSL v2 |
 | PHC's clip filter list (`data/assets/`) | ZhengyiLuo/PHC label list, keyed by HumanML3D clip id | BSD-3-Clause |
 | object dimensions and masses (`sim/`) | measured from AI2-THOR's metadata | Apache-2.0 |
 | figures printed in the paper | the paper, quoted as figures | cited |

@@ -13,7 +13,7 @@ from exchange import Job, Outcome, Results, timed
 
 from data.retarget import Retargeter
 from data.skeleton import HumanMotion
-from sim.robots.spec import load_robot
+from robots.spec import load_robot
 
 
 def main(job_path: Path, result_path: Path) -> None:

@@ -13,7 +13,7 @@ class RobotConfig:
 
     Attributes:
         name: name in commands, tables and file names.
-        spec: path of the robot's YAML description (`sim/robots/README.md`); None takes the built-in description of that name.
+        spec: path of the robot's YAML description (`robots/README.md`); None takes the built-in description of that name.
         mjcf: path of an MJCF file that replaces the description's own, for example one with the vendor's meshes; its joint,
             body and site names must be the ones that the description uses.
     """

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from configs.schema.eval import PlannerConfig
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
+from interface.feedback import Feedback
+from interface.observation import Observation
 from proprio_mllm.backends.batching import Batcher
 from proprio_mllm.planners.protocol import BatchPlanner, PlannerReply, TaskInfo
 from proprio_mllm.planners.registry import make_planner

@@ -12,7 +12,7 @@ trace:
 3. The type that most of them have decides, in a tie the type of the last one.
 4. Without any standing failure the plan itself was wrong or stopped too early: logical.
 
-A failure's own type comes with its code (`data.interface.failures`): out of reach at every pelvis height is navigation, out of
+A failure's own type comes with its code (`interface.failures`): out of reach at every pelvis height is navigation, out of
 reach at this pelvis height is body adjustment, the rest is logical, invalid replies included.
 """
 
@@ -23,10 +23,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from data.interface.actions import ActionKind
-from data.interface.effects import Grasp, LetGo, PutDown
-from data.interface.failures import INVALID_OUTPUT, FailureCategory, FailureCode
-from data.interface.steps import Action
+from interface.actions import ActionKind
+from interface.effects import Grasp, LetGo, PutDown
+from interface.failures import INVALID_OUTPUT, FailureCategory, FailureCode
+from interface.steps import Action
 
 if TYPE_CHECKING:
     from sim.tasks.task import Task

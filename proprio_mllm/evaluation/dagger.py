@@ -25,12 +25,12 @@ import numpy as np
 from tqdm import tqdm
 
 from configs.schema.collect import CollectConfig
-from data.interface.actions import ACTIONS, ActionKind
-from data.interface.bodies import PAPER_ROBOTS, Arm
-from data.interface.observation import HistoryItem, Observation
-from data.interface.steps import Action, PlanStep
 from data.shards import Manifest, ShardWriter, config_hash
 from data.workers import worker_pool
+from interface.actions import ACTIONS, ActionKind
+from interface.bodies import PAPER_ROBOTS, Arm
+from interface.observation import HistoryItem, Observation
+from interface.steps import Action, PlanStep
 from proprio_mllm.planners.protocol import TaskInfo
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 from proprio_mllm.training.rollouts import DaggerRequest

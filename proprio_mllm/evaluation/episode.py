@@ -23,10 +23,10 @@ from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 
-from data.interface.episode import STEP_LIMIT, EpisodeRecord, Outcome
-from data.interface.feedback import Feedback
-from data.interface.observation import HistoryItem, Observation
-from data.interface.steps import PlanStep
+from interface.episode import STEP_LIMIT, EpisodeRecord, Outcome
+from interface.feedback import Feedback
+from interface.observation import HistoryItem, Observation
+from interface.steps import PlanStep
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, attribute
 from proprio_mllm.evaluation.seeds import stream
 from proprio_mllm.evaluation.showing import Showing

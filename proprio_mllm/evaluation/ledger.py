@@ -18,7 +18,7 @@ from typing import Any, Final, Self
 
 from configs.validate import ConfigError, build
 from data.files import parse_json
-from data.interface.episode import EpisodeRecord, Outcome
+from interface.episode import EpisodeRecord, Outcome
 
 __all__ = ["LEDGER_VERSION", "EpisodeKey", "Ledger", "LedgerError", "key_of", "read_ledger", "scored"]
 

@@ -20,13 +20,13 @@ from typing import Final
 
 import numpy as np
 
-from data.interface.actions import ACTIONS
-from data.interface.bodies import PAPER_ROBOTS
-from data.interface.failures import FAILURES
-from data.interface.observation import HistoryItem
-from data.interface.sightings import Shown, Sightings
-from data.interface.steps import Action, PlanStep
 from data.shards import ShardReader
+from interface.actions import ACTIONS
+from interface.bodies import PAPER_ROBOTS
+from interface.failures import FAILURES
+from interface.observation import HistoryItem
+from interface.sightings import Shown, Sightings
+from interface.steps import Action, PlanStep
 from proprio_mllm.model.wording import (
     ID_NUMBERS,
     MARKERS,
@@ -42,10 +42,10 @@ from proprio_mllm.model.wording import (
 )
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 from proprio_mllm.training.sources import held_out
+from robots.spec import load_robot
 from sim.collection.demonstrations import MISTAKES
 from sim.collection.text_tasks import draw_task
 from sim.collection.text_world import TextWorld, feedback_text
-from sim.robots.spec import load_robot
 from sim.scene.catalogue import load_catalogue
 from sim.tasks.instructions import ORDINALS, TEMPLATES, natural_name, plural
 from sim.tasks.sample import TRAIN_ROOMS, rng_for

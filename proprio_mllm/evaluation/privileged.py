@@ -7,8 +7,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
+from interface.feedback import Feedback
+from interface.observation import Observation
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 from sim.expert.expert import Expert
 from sim.session.session import Session

@@ -16,7 +16,7 @@ import numpy as np
 
 from configs.schema.eval import PlannerConfig
 from data.cluster import import_ray
-from data.interface.observation import Observation
+from interface.observation import Observation
 from proprio_mllm.evaluation.asking import AskingPlanner, ModelDesk, batch_planner
 from proprio_mllm.evaluation.pool import Worker
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo

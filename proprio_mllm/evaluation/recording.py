@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from data.interface.episode import EpisodeRecord, Outcome
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
+from interface.episode import EpisodeRecord, Outcome
+from interface.feedback import Feedback
+from interface.observation import Observation
 from proprio_mllm.planners.protocol import PlannerReply
 from proprio_mllm.training.rollouts import rollout_row
 from sim.tasks.task import Task

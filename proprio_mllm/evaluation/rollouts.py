@@ -17,8 +17,8 @@ from tqdm import tqdm
 
 from configs.schema.eval import DifficultyName, PlannerConfig
 from configs.schema.robot import RobotConfig
-from data.interface.bodies import PAPER_ROBOTS
 from data.shards import ShardWriter
+from interface.bodies import PAPER_ROBOTS
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
 from proprio_mllm.evaluation.pool import run_jobs
 from proprio_mllm.evaluation.seeds import episode_seed

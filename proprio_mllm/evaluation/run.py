@@ -29,7 +29,7 @@ from configs.schema.eval import CHAT_KINDS, EvalConfig, PlannerConfig
 from data.cluster import import_ray
 from data.code_files import source_digest, split_source
 from data.files import file_hash, write_text
-from data.interface.episode import EpisodeRecord, Outcome
+from interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.backends.factory import check_cap, make_backend, told_revision
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest
@@ -43,7 +43,7 @@ from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, Opener, Wo
 from proprio_mllm.planners.memory import MEMORY_FILE, check_memory
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.planners.registry import make_chat_planner, make_planner
-from sim.robots.spec import load_robot
+from robots.spec import load_robot
 from sim.scene.compiler import PHYSICS
 from sim.session.contingency import load_contingency
 from sim.tasks.task import Task, load_benchmark, read_tasks

@@ -17,8 +17,8 @@ from typing import Final
 from configs.compose import compose
 from configs.schema.eval import EvalConfig
 from configs.validate import build
-from data.interface.bodies import PAPER_ROBOTS
-from data.interface.episode import Outcome
+from interface.bodies import PAPER_ROBOTS
+from interface.episode import Outcome
 from proprio_mllm.evaluation.run import evaluate
 from sim.tasks.task import load_benchmark, write_tasks
 

@@ -28,8 +28,8 @@ from typing import Any, Final
 import numpy as np
 
 from configs.schema.eval import PlannerConfig
-from data.interface.observation import Observation
 from data.workers import start_worker
+from interface.observation import Observation
 from proprio_mllm.evaluation.asking import AskingPlanner, ModelDesk, batch_planner
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 
 from configs.schema.eval import DifficultyName, StartName
 from configs.schema.robot import RobotConfig
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
-from data.interface.steps import PlanStep
+from interface.feedback import Feedback
+from interface.observation import Observation
+from interface.steps import PlanStep
 from proprio_mllm.evaluation.attribution import unmet_objects
 from proprio_mllm.evaluation.episode import GoalReport, RunnableSession, Stats
 from proprio_mllm.evaluation.starts import started

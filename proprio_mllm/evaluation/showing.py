@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs.schema.eval import BlindName, FeedbackName
-from data.interface.failures import FAILED
-from data.interface.feedback import ActionOutcome, Feedback
-from data.interface.observation import HistoryItem, Observation, Proprioception
+from interface.failures import FAILED
+from interface.feedback import ActionOutcome, Feedback
+from interface.observation import HistoryItem, Observation, Proprioception
 
 __all__ = ["Showing", "grey"]
 

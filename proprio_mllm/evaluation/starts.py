@@ -15,7 +15,7 @@ import numpy as np
 
 from configs.schema.eval import StartName
 from proprio_mllm.evaluation.seeds import stream
-from sim.robots.spec import RobotSpec, load_robot
+from robots.spec import RobotSpec, load_robot
 from sim.skills.obstacles import navigation_map
 from sim.tasks.task import Start, Task
 from sim.world.world import World, WorldError

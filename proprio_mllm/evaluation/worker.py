@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 from configs.schema.backend import BackendConfig
 from configs.schema.eval import DifficultyName, FeedbackName, PlannerConfig, StartName
 from configs.schema.robot import RobotConfig
-from data.interface.episode import STEP_LIMIT, EpisodeRecord, Outcome
+from interface.episode import STEP_LIMIT, EpisodeRecord, Outcome
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest, CostCapError, UnreachableError
 from proprio_mllm.evaluation.asking import answer_all
 from proprio_mllm.evaluation.episode import (

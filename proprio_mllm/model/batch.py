@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from configs.schema.model import ModelConfig
-from data.interface.observation import Camera
+from interface.observation import Camera
 from proprio_mllm.model.chat import Encoded, Message, encode
 from proprio_mllm.model.geometry import centroid
 from proprio_mllm.model.mpe import Centroid, position_ids

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs.schema.model import CentroidName
-from data.interface.bodies import KEY_BODIES
-from data.interface.observation import Camera
+from interface.bodies import KEY_BODIES
+from interface.observation import Camera
 
 __all__ = ["arm_length_m", "body_point_in_pelvis", "centroid", "project", "unproject"]
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from configs.schema.model import ModelConfig
-from data.interface.observation import Observation
-from data.interface.sightings import Seen, Sightings
+from interface.observation import Observation
+from interface.sightings import Seen, Sightings
 from proprio_mllm.model.batch import Example, View
 from proprio_mllm.model.chat import IMAGE, Encoded
 from proprio_mllm.model.modeling import ProprioMLLM

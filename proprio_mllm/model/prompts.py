@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
-from data.interface.observation import HistoryItem
+from interface.observation import HistoryItem
 from proprio_mllm.model.chat import Message
 from proprio_mllm.model.vocabulary import motion_text
 

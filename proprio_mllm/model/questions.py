@@ -15,8 +15,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import KEY_BODIES
-from data.interface.steps import Action
+from interface.bodies import KEY_BODIES
+from interface.steps import Action
 from proprio_mllm.model.geometry import arm_length_m
 from proprio_mllm.model.prompts import Style
 

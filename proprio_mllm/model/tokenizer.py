@@ -15,7 +15,7 @@ from tokenizers import Regex, Tokenizer, decoders, models, normalizers, pre_toke
 from transformers import AddedToken, Qwen2Tokenizer
 from transformers.models.qwen2.tokenization_qwen2 import PRETOKENIZE_REGEX
 
-from data.interface.actions import ACTIONS
+from interface.actions import ACTIONS
 
 __all__ = ["ID_SUFFIXES", "SPECIAL_TOKENS", "train_tokenizer"]
 

@@ -8,7 +8,7 @@
 
 Ids and instructions share their words (`DiningTable_1` is `dining table _1`), so that a thing is named by copying, not by
 remembering. Nothing is in these words that an `Observation` does not hold; `now` is computed from the log by the table of
-effects (`data.interface.belief`).
+effects (`interface.belief`).
 
 The paper does not publish its prompts; the wording is ours.
 """
@@ -20,15 +20,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from data.interface.actions import ACTIONS, ActionKind
-from data.interface.belief import ARM_SPECIFIC, UNKNOWN, Belief
-from data.interface.bodies import Arm
-from data.interface.effects import Condition
-from data.interface.failures import FAILED
-from data.interface.observation import HistoryItem
-from data.interface.sightings import Seen, Sightings
-from data.interface.steps import Action, PlanStep
-from data.interface.symbolic import events_of
+from interface.actions import ACTIONS, ActionKind
+from interface.belief import ARM_SPECIFIC, UNKNOWN, Belief
+from interface.bodies import Arm
+from interface.effects import Condition
+from interface.failures import FAILED
+from interface.observation import HistoryItem
+from interface.sightings import Seen, Sightings
+from interface.steps import Action, PlanStep
+from interface.symbolic import events_of
 
 __all__ = [
     "END",

@@ -9,11 +9,11 @@ import functools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Final
 
-from data.interface.actions import ACTIONS, ActionKind, ActionSpec, Amount, exclude_each_other
-from data.interface.belief import Belief
-from data.interface.bodies import Arm
-from data.interface.effects import Condition, Grasp, Walk
-from data.interface.steps import Action
+from interface.actions import ACTIONS, ActionKind, ActionSpec, Amount, exclude_each_other
+from interface.belief import Belief
+from interface.bodies import Arm
+from interface.effects import Condition, Grasp, Walk
+from interface.steps import Action
 from proprio_mllm.model.wording import END, id_words, number_words
 from proprio_mllm.planners.furniture import CONTAINERS, FIXTURES, SEATS, SURFACES
 from proprio_mllm.planners.scripted.words import type_of

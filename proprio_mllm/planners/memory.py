@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from configs.validate import ConfigError, build
 from data.files import file_hash
-from data.interface.observation import HistoryItem
-from data.interface.steps import PlanStep
+from interface.observation import HistoryItem
+from interface.steps import PlanStep
 from proprio_mllm.planners.protocol import succeeded
 
 __all__ = [

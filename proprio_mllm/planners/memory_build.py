@@ -24,9 +24,9 @@ from tqdm import tqdm
 
 from configs.arguments import command, read_arguments
 from data.files import file_hash, new_folder, write_text
-from data.interface.observation import HistoryItem
-from data.interface.steps import PlanStep
 from data.shards import ShardError, ShardReader, decode_png
+from interface.observation import HistoryItem
+from interface.steps import PlanStep
 from proprio_mllm.planners.chat.sight import SightError, image_encoder, weights_digest
 from proprio_mllm.planners.memory import (
     IMAGES_FILE,

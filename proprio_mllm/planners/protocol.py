@@ -15,11 +15,11 @@ from typing import Any, Final, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from data.interface.episode import STEP_LIMIT
-from data.interface.feedback import Feedback
-from data.interface.observation import HistoryItem, Observation
-from data.interface.sightings import Seen
-from data.interface.steps import ActionError, PlanStep
+from interface.episode import STEP_LIMIT
+from interface.feedback import Feedback
+from interface.observation import HistoryItem, Observation
+from interface.sightings import Seen
+from interface.steps import ActionError, PlanStep
 
 __all__ = [
     "ONE_CALL",

@@ -11,11 +11,11 @@ import time
 
 import numpy as np
 
-from data.interface.actions import ACTIONS, ActionKind
-from data.interface.bodies import Arm
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
-from data.interface.steps import Action, PlanStep
+from interface.actions import ACTIONS, ActionKind
+from interface.bodies import Arm
+from interface.feedback import Feedback
+from interface.observation import Observation
+from interface.steps import Action, PlanStep
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 
 __all__ = ["RandomPlanner"]

@@ -26,12 +26,12 @@ from peft import PeftModel
 from torch import Tensor
 from transformers import DynamicCache
 
-from data.interface.effects import Walk
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
-from data.interface.sightings import Seen
-from data.interface.steps import PlanStep
-from data.interface.symbolic import events_of
+from interface.effects import Walk
+from interface.feedback import Feedback
+from interface.observation import Observation
+from interface.sightings import Seen
+from interface.steps import PlanStep
+from interface.symbolic import events_of
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import load_model, load_motion, merge_adapter
 from proprio_mllm.model.chat import Encoded

@@ -36,9 +36,9 @@ from configs.schema.collect import CollectConfig
 from configs.schema.model import ModelConfig
 from configs.validate import ConfigError, build
 from data.files import write_text
-from data.interface.bodies import PAPER_ROBOTS
-from data.interface.observation import Proprioception
 from data.motion import FPS
+from interface.bodies import PAPER_ROBOTS
+from interface.observation import Proprioception
 from proprio_mllm.backends.factory import make_backend
 from proprio_mllm.backends.protocol import Backend, ChatMessage, ChatRequest
 from proprio_mllm.evaluation.showing import grey

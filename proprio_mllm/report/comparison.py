@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from data.interface.episode import EpisodeRecord, Outcome
+from interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.report.statistics import Comparison, compare
 from proprio_mllm.report.stored import Run
 from proprio_mllm.report.summary import CATEGORIES

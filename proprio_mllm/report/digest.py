@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from data.files import file_hash
-from data.interface.episode import EpisodeRecord, Outcome
+from interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, Deciding, deciding_failure, unmet_objects
 from proprio_mllm.report.frames import ActedOut, episode_id
 from proprio_mllm.report.runs import Run

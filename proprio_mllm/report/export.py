@@ -23,7 +23,7 @@ from datasets.arrow_writer import ArrowWriter
 
 from configs.arguments import read_named
 from data.files import file_hash, new_folder, write_text
-from data.interface.episode import Outcome
+from interface.episode import Outcome
 from proprio_mllm.report.digest import run_digest
 from proprio_mllm.report.frames import ActedOut
 from proprio_mllm.report.html import FrameChoice, run_data

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from configs.schema.eval import ExperimentConfig
-from data.interface.episode import Outcome
+from interface.episode import Outcome
 from proprio_mllm.report.runs import Run, newest
 from proprio_mllm.report.summary import Row
 from sim.tasks.task import Task, load_benchmark, tasks_text

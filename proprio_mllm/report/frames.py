@@ -25,7 +25,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from data.files import write_text
-from data.interface.episode import EpisodeRecord
+from interface.episode import EpisodeRecord
 from proprio_mllm.evaluation.ledger import to_json
 from proprio_mllm.evaluation.pool import run_jobs
 from proprio_mllm.report.reenact import Episode, Reenactment

@@ -25,7 +25,7 @@ import jinja2
 from configs.arguments import read_named
 from configs.validate import ConfigError
 from data.files import write_text
-from data.interface.episode import EpisodeRecord, Outcome
+from interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.report.digest import episode_digest, run_digest
 from proprio_mllm.report.frames import ActedOut, act_out, episode_id
 from proprio_mllm.report.reenact import Episode, RunTasks, TaskGoneError

@@ -26,10 +26,10 @@ from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
-from data.interface.actions import ActionKind
-from data.interface.episode import EpisodeRecord, Outcome
-from data.interface.failures import FailureCode
-from data.interface.steps import Action, ActionError
+from interface.actions import ActionKind
+from interface.episode import EpisodeRecord, Outcome
+from interface.failures import FailureCode
+from interface.steps import Action, ActionError
 from proprio_mllm.report.statistics import cluster_bootstrap
 
 __all__ = ["Certificate", "Extras", "References", "extras_of", "first_tries", "path_efficiency", "recoveries"]

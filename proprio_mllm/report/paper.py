@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import yaml
 
-from data.interface.bodies import PAPER_ROBOTS
+from interface.bodies import PAPER_ROBOTS
 
 __all__ = ["PAPER_ROWS", "paper_ablation", "paper_main", "paper_replanning"]
 

@@ -15,10 +15,10 @@ from pathlib import Path
 
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.validate import build
-from data.interface.episode import EpisodeRecord
-from data.interface.feedback import Feedback
-from data.interface.observation import HistoryItem, Observation
-from data.interface.steps import PlanStep
+from interface.episode import EpisodeRecord
+from interface.feedback import Feedback
+from interface.observation import HistoryItem, Observation
+from interface.steps import PlanStep
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT
 from proprio_mllm.evaluation.episode import Limits
 from proprio_mllm.evaluation.run import plan_episodes, select_tasks

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 import sim.tasks
-from data.interface.episode import EpisodeRecord, Outcome
+from interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.run import task_key
 from proprio_mllm.report.metrics import Certificate, References
 from proprio_mllm.report.stored import Run, load_run, read_metadata

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from data.interface.episode import Outcome
-from data.interface.manual import action_manual, code_manual
-from data.interface.observation import HistoryItem, Observation
 from data.shards import encode_png
+from interface.episode import Outcome
+from interface.manual import action_manual, code_manual
+from interface.observation import HistoryItem, Observation
 from proprio_mllm.evaluation.pool import run_jobs
 from proprio_mllm.model.chat import Message, to_chat
 from proprio_mllm.model.prompts import answers, last_steps, with_answer

@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from data.interface.episode import EpisodeRecord, Outcome
+from interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.ledger import read_ledger
 from proprio_mllm.evaluation.naming import options_of
 from proprio_mllm.report.metrics import References

@@ -36,8 +36,8 @@ from typing import Any, Final
 import numpy as np
 
 from data.files import write_text
-from data.interface.episode import EpisodeRecord, Outcome
-from data.interface.failures import FailureCategory
+from interface.episode import EpisodeRecord, Outcome
+from interface.failures import FailureCategory
 from proprio_mllm.report.metrics import Extras, References, extras_of
 from proprio_mllm.report.statistics import rate_interval
 

@@ -34,7 +34,7 @@ from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.motion_stage import bits_per_s, codebook_use, perplexity, reconstruction_metrics
 from proprio_mllm.training.reconstruction import draw_use
 from proprio_mllm.training.sources import Clips
-from sim.robots.spec import available_robots, load_robot
+from robots.spec import available_robots, load_robot
 
 __all__ = ["Options", "Row", "evaluate_tokenizer", "main", "real_windows", "table", "windows_of"]
 

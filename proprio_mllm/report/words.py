@@ -1,6 +1,6 @@
 """Failure codes and margins in words, for people who read an episode.
 
-Margins are signed and named as `data.interface.failures` says.
+Margins are signed and named as `interface.failures` says.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from data.interface.failures import FAILURES, FailureCode
+from interface.failures import FAILURES, FailureCode
 
 __all__ = ["code_in_words", "margins_in_words"]
 

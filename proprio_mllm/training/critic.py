@@ -15,9 +15,9 @@ from typing import Literal
 
 import numpy as np
 
-from data.interface.actions import ActionKind
-from data.interface.sightings import Shown
-from data.interface.steps import Action, PlanStep
+from interface.actions import ActionKind
+from interface.sightings import Shown
+from interface.steps import Action, PlanStep
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import use_adapter
 from proprio_mllm.model.chat import Message

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from configs.schema.model import MotionTokenizerConfig
-from data.interface.bodies import KEY_BODIES
 from data.motion import FPS, HAND_OPENING, KEY_BODY_COUNT, N_FEATURES, OPEN_HAND, PELVIS_HEIGHT
+from interface.bodies import KEY_BODIES
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.posture import in_other_postures
 from proprio_mllm.training.sources import Clips, held_out

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data.interface.bodies import KEY_BODIES
 from data.motion import KEY_BODY_COUNT, PELVIS_HEIGHT, PLANAR_VELOCITY, YAW_RATE
+from interface.bodies import KEY_BODIES
 
 __all__ = ["in_other_postures"]
 

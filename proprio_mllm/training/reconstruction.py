@@ -19,8 +19,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from data.interface.bodies import KEY_BODIES
 from data.motion import FPS, decode_key_bodies
+from interface.bodies import KEY_BODIES
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.motion_stage import codebook_use
 from proprio_mllm.training.sources import Clips

@@ -20,9 +20,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.observation import Camera, HistoryItem, Observation
 from data.motion import KEY_BODY_COUNT
 from data.shards import ShardReader, decode_motion, decode_png, encode_png
+from interface.observation import Camera, HistoryItem, Observation
 from proprio_mllm.model.batch import View
 
 __all__ = ["DaggerRequest", "Moment", "Rollout", "RolloutCollector", "RolloutRequest", "read_rollouts", "rollout_row"]

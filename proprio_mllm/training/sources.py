@@ -21,9 +21,9 @@ import torch
 from numpy.typing import NDArray
 
 from configs.schema.model import ModelConfig
-from data.interface.observation import Camera
 from data.motion import HAND_OPENING, KEY_BODY_COUNT, OPEN_HAND
 from data.shards import Manifest, ShardError, ShardReader, decode_depth, decode_motion, decode_png, decode_segmentation
+from interface.observation import Camera
 from proprio_mllm.model.batch import View
 from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer

@@ -7,9 +7,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from data.interface.effects import Condition
-from data.interface.observation import HistoryItem
-from data.interface.symbolic import SymbolicState, events_of
+from interface.effects import Condition
+from interface.observation import HistoryItem
+from interface.symbolic import SymbolicState, events_of
 
 __all__ = ["asked_relation", "history_of", "states_from_log"]
 

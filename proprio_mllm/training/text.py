@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from configs.schema.model import ModelConfig
-from data.interface.actions import ACTIONS
+from interface.actions import ACTIONS
 from proprio_mllm.model.chat import render
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import critic_prompt, looking, self_ask_prompt

@@ -16,8 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from data.interface.bodies import PAPER_ROBOTS, Arm
-from data.interface.episode import STEP_LIMIT
+from interface.bodies import PAPER_ROBOTS, Arm
+from interface.episode import STEP_LIMIT
 from sim.scene.compiler import PHYSICS
 from sim.tasks.families import family_of
 from sim.tasks.task import BENCHMARK_PATH, Task

@@ -25,8 +25,8 @@ from tqdm import tqdm
 from configs.arguments import command, read_arguments
 from configs.validate import allowed_values
 from data.files import write_text
-from data.interface.bodies import PAPER_ROBOTS
 from data.workers import worker_pool
+from interface.bodies import PAPER_ROBOTS
 from sim.benchmark.certificates import (
     CERTIFICATES_PATH,
     Certificate,

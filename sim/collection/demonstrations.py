@@ -26,11 +26,11 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from configs.schema.collect import CollectConfig
-from data.interface.actions import ActionKind
-from data.interface.failures import FailureCode
-from data.interface.observation import HistoryItem, Observation
-from data.interface.steps import Action, PlanStep
 from data.shards import encode_png
+from interface.actions import ActionKind
+from interface.failures import FailureCode
+from interface.observation import HistoryItem, Observation
+from interface.steps import Action, PlanStep
 from sim.expert.expert import Expert
 from sim.session.session import Session
 from sim.tasks.families import CATEGORIES, FAMILIES

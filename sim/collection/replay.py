@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs.schema.data import ReplayConfig
-from data.interface.motion import Motion
 from data.motion import yaw_from_quaternion
 from data.pipeline import Pictures
 from data.shards import encode_png
+from interface.motion import Motion
+from robots.spec import load_robot
 from sim.collection.view_sampling import camera_in_pelvis
-from sim.robots.spec import load_robot
 from sim.scene.compiler import BASE_JOINTS
 from sim.skills.obstacles import navigation_map
 from sim.world.world import World

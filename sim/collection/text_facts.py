@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Final
 
-from data.interface.bodies import Arm
-from data.interface.effects import Condition
-from data.interface.facts import Call
-from data.interface.symbolic import SymbolicState
+from interface.bodies import Arm
+from interface.effects import Condition
+from interface.facts import Call
+from interface.symbolic import SymbolicState
+from robots.spec import RobotSpec
 from sim.expert.jobs import Facts as JobFacts
-from sim.robots.spec import RobotSpec
 from sim.scene.catalogue import ObjectType, load_catalogue
 from sim.tasks.drafts import Draft, Scene
 
@@ -33,7 +33,7 @@ _STARTS: Final = {
 
 
 class TextObject:
-    """One object as `data.interface.facts.ObjectFacts`."""
+    """One object as `interface.facts.ObjectFacts`."""
 
     def __init__(self, object_id: str, kind: ObjectType, facts: TextFacts) -> None:
         self.object_id, self.kind, self._facts = object_id, kind, facts
@@ -114,7 +114,7 @@ class TextObject:
 
 
 class TextFacts:
-    """The world of one task as `data.interface.facts.Facts`.
+    """The world of one task as `interface.facts.Facts`.
 
     Attributes:
         state: who holds what, what stands on what, states of objects.
@@ -142,7 +142,7 @@ class TextFacts:
         self._taps = {basin: tap for tap, basin in scene.basins.items()}
         self._heated: dict[str, int] = {}
 
-    # ---- data.interface.facts.Facts
+    # ---- interface.facts.Facts
 
     def held(self, arm: Arm) -> str | None:
         """What a hand holds by itself."""

@@ -1,6 +1,6 @@
 """The text world: a robot among facts, where what an action does is what the table of actions says.
 
-Preconditions and effects come from `data.interface.actions`, so every action is there with its failure codes. What the table
+Preconditions and effects come from `interface.actions`, so every action is there with its failure codes. What the table
 does not know is drawn here, because it follows from geometry in the simulator: what one stands at, which things there are near
 enough, from which pelvis heights the arms reach a piece of furniture, what comes into view, and what now and then does not work
 from a stance.
@@ -13,14 +13,14 @@ from typing import Final
 
 import numpy as np
 
-from data.interface.actions import ACTIONS, ActionKind, exclude_each_other, first_refusal
-from data.interface.bodies import Arm
-from data.interface.effects import Condition, PutDown
-from data.interface.failures import FailureCode
-from data.interface.steps import Action, PlanStep
+from interface.actions import ACTIONS, ActionKind, exclude_each_other, first_refusal
+from interface.bodies import Arm
+from interface.effects import Condition, PutDown
+from interface.failures import FailureCode
+from interface.steps import Action, PlanStep
+from robots.spec import RobotSpec
 from sim.collection.text_facts import TextFacts
 from sim.expert.jobs import plan_jobs
-from sim.robots.spec import RobotSpec
 from sim.tasks.drafts import Draft, Scene
 
 __all__ = ["TextWorld", "feedback_text"]

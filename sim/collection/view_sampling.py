@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs.schema.collect import CollectConfig
-from data.interface.bodies import SIDES, Arm
 from data.motion import encode_frames, world_to_heading
 from data.shards import encode_png
-from sim.robots.build_solver import robot_kit
+from interface.bodies import SIDES, Arm
+from robots.build_solver import robot_kit
 from sim.scene.catalogue import load_catalogue
 from sim.scene.compiler import BASE_JOINTS
 from sim.skills.body.ready import ready_posture

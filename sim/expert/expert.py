@@ -17,11 +17,11 @@ from typing import Final
 
 import numpy as np
 
-from data.interface.actions import ACTIONS
-from data.interface.bodies import Arm
-from data.interface.effects import PutDown
-from data.interface.failures import FailureCode
-from data.interface.steps import Action, PlanStep
+from interface.actions import ACTIONS
+from interface.bodies import Arm
+from interface.effects import PutDown
+from interface.failures import FailureCode
+from interface.steps import Action, PlanStep
 from sim.expert.jobs import Facts, Job, plan_jobs
 from sim.expert.lookahead import HEIGHT_STEP_M, Rehearsal
 from sim.session.session import Session

@@ -13,10 +13,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from data.interface.actions import ACTIONS, ActionKind, bringing_about
-from data.interface.bodies import Arm
-from data.interface.effects import Condition
-from data.interface.steps import Action
+from interface.actions import ACTIONS, ActionKind, bringing_about
+from interface.bodies import Arm
+from interface.effects import Condition
+from interface.steps import Action
 from sim.tasks.predicates import Predicate
 
 __all__ = ["Facts", "Job", "pending_leaves", "plan_jobs"]

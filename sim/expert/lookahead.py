@@ -13,7 +13,7 @@ from typing import Final
 import mujoco
 import numpy as np
 
-from data.interface.steps import Action, PlanStep
+from interface.steps import Action, PlanStep
 from sim.session.session import Session
 from sim.skills.locomotion import best_stance
 from sim.skills.navigation import Stance

@@ -1,4 +1,4 @@
-"""Other simulators' action names: AI2-THOR's and DualTHOR's, mapped onto the action grammar of `data.interface.steps`.
+"""Other simulators' action names: AI2-THOR's and DualTHOR's, mapped onto the action grammar of `interface.steps`.
 
 Units follow the names' origin. DualTHOR: `moveahead` with magnitude 1 is 1 m, `moveup` 0.1 m, `rotateright` 90 degrees.
 AI2-THOR: `moveMagnitude` in metres, `degrees` for rotations. Episode control (undo, save, teleport ...) is not part of the
@@ -13,9 +13,9 @@ from typing import Any, Final
 import numpy as np
 
 from configs.validate import allowed_values
-from data.interface.actions import ACTIONS, ActionKind
-from data.interface.bodies import Arm
-from data.interface.steps import Action
+from interface.actions import ACTIONS, ActionKind
+from interface.bodies import Arm
+from interface.steps import Action
 
 __all__ = ["ALIASES", "ARGUMENTS", "number", "to_action"]
 

@@ -21,10 +21,10 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import DEFAULT_ROBOT
-from data.interface.failures import FailureCode
-from data.interface.feedback import ActionOutcome
-from data.interface.steps import Action, PlanStep
+from interface.bodies import DEFAULT_ROBOT
+from interface.failures import FailureCode
+from interface.feedback import ActionOutcome
+from interface.steps import Action, PlanStep
 from sim.interfaces.aliases import number, to_action
 from sim.interfaces.poses import interactable_poses, random_placements, set_object_poses
 from sim.scene.rooms import load_room

@@ -24,10 +24,10 @@ from typing import Any, Final
 import imageio.v3 as iio
 import numpy as np
 
-from data.interface.bodies import PAPER_ROBOTS, Arm
-from data.interface.failures import FailureCode
-from data.interface.feedback import ActionOutcome
-from data.interface.steps import Action, PlanStep
+from interface.bodies import PAPER_ROBOTS, Arm
+from interface.failures import FailureCode
+from interface.feedback import ActionOutcome
+from interface.steps import Action, PlanStep
 from sim.interfaces.aliases import to_action
 from sim.interfaces.controller import Stopped
 from sim.interfaces.poses import interactable_poses

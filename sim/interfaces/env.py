@@ -1,7 +1,7 @@
 """Gymnasium environment: plan steps as text in, images and proprioception out, reward when the goals hold.
 
 For users of reinforcement-learning tooling; the evaluation uses `sim.session.session` directly. The action is a plan step in
-the textual grammar of `data.interface.steps` (`Pick(left, Mug_1) & Open(right, Fridge_1)`). Text outside the grammar changes
+the textual grammar of `interface.steps` (`Pick(left, Mug_1) & Open(right, Fridge_1)`). Text outside the grammar changes
 nothing, costs a step and is reported in `info`. Paper: DualTHOR as an environment; the reward is ours (share of goal
 conditions that hold, 1 at success).
 
@@ -20,12 +20,12 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from data.interface.bodies import DEFAULT_ROBOT, KEY_BODIES
-from data.interface.episode import STEP_LIMIT
-from data.interface.failures import INVALID_OUTPUT
-from data.interface.observation import Observation
-from data.interface.steps import ActionError, PlanStep
 from data.motion import N_FEATURES
+from interface.bodies import DEFAULT_ROBOT, KEY_BODIES
+from interface.episode import STEP_LIMIT
+from interface.failures import INVALID_OUTPUT
+from interface.observation import Observation
+from interface.steps import ActionError, PlanStep
 from sim.session.session import FreePlay, Session, TaskLike
 from sim.world.recorder import HISTORY_FRAMES
 

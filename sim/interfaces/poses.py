@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import Arm
+from interface.bodies import Arm
 from sim.scene.catalogue import load_catalogue
 from sim.scene.objects import ObjectPlacement
 from sim.scene.rooms import load_room

@@ -23,10 +23,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.actions import ACTIONS, ActionKind
-from data.interface.bodies import DEFAULT_ROBOT, Arm
-from data.interface.failures import FailureCode
-from data.interface.steps import Action
+from interface.actions import ACTIONS, ActionKind
+from interface.bodies import DEFAULT_ROBOT, Arm
+from interface.failures import FailureCode
+from interface.steps import Action
 from sim.interfaces import controller as own
 from sim.interfaces.aliases import ALIASES, number
 from sim.interfaces.poses import interactable_poses

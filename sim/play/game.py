@@ -16,11 +16,11 @@ from typing import Any, Final
 import imageio.v3 as iio
 
 from configs.validate import allowed_values
-from data.interface.actions import ACTIONS, ActionKind, first_refusal
-from data.interface.bodies import DEFAULT_ROBOT, Arm
-from data.interface.steps import Action, PlanStep
+from interface.actions import ACTIONS, ActionKind, first_refusal
+from interface.bodies import DEFAULT_ROBOT, Arm
+from interface.steps import Action, PlanStep
+from robots.spec import available_robots
 from sim.play.live import LiveView
-from sim.robots.spec import available_robots
 from sim.scene.rooms import room_names
 from sim.session.contingency import DIFFICULTIES
 from sim.session.session import FreePlay, Session, TaskLike

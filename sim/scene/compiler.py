@@ -83,7 +83,7 @@ _LID_SOLIMP: Final = (0.97, 0.98, 0.001, 0.5, 2.0)
 
 
 class RobotForScene(Protocol):
-    """What a scene needs of a robot: `sim.robots.spec.RobotSpec` has it."""
+    """What a scene needs of a robot: `robots.spec.RobotSpec` has it."""
 
     @property
     def name(self) -> str: ...

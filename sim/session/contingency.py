@@ -22,7 +22,7 @@ import yaml
 import configs
 from configs.assets import asset_files
 from configs.validate import build
-from data.interface.actions import ACTIONS
+from interface.actions import ACTIONS
 
 __all__ = ["DIFFICULTIES", "OUTCOMES", "Contingency", "ContingencyConfig", "OutcomeRule", "load_contingency"]
 

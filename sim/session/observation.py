@@ -10,8 +10,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.observation import Camera, HistoryItem, Observation, Proprioception
 from data.motion import encode_frames, world_to_heading
+from interface.observation import Camera, HistoryItem, Observation, Proprioception
 from sim.world.recorder import FRAME_DT_S
 from sim.world.rendering import VISIBILITY_SIZE, camera_intrinsics, camera_pose
 from sim.world.world import World

@@ -17,15 +17,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from data.interface.actions import ActionKind
-from data.interface.bodies import Arm
-from data.interface.effects import PutDown
-from data.interface.episode import STEP_LIMIT
-from data.interface.feedback import ActionOutcome, Feedback
-from data.interface.observation import HistoryItem, Observation
-from data.interface.steps import Action, PlanStep
-from sim.robots.build_solver import robot_kit
-from sim.robots.spec import load_robot
+from interface.actions import ActionKind
+from interface.bodies import Arm
+from interface.effects import PutDown
+from interface.episode import STEP_LIMIT
+from interface.feedback import ActionOutcome, Feedback
+from interface.observation import HistoryItem, Observation
+from interface.steps import Action, PlanStep
+from robots.build_solver import robot_kit
+from robots.spec import load_robot
 from sim.scene.objects import Placement
 from sim.session.contingency import Contingency, load_contingency
 from sim.session.observation import observe

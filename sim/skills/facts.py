@@ -1,6 +1,6 @@
 """The facts that preconditions ask for, answered from the simulated world; and the refusal of what cannot be done.
 
-The preconditions themselves stand in the table of actions (`data.interface.actions`). What counts as open, full or too heavy is
+The preconditions themselves stand in the table of actions (`interface.actions`). What counts as open, full or too heavy is
 decided here, where physics knows it.
 """
 
@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from typing import Final
 
-from data.interface.actions import first_refusal
-from data.interface.bodies import Arm
-from data.interface.steps import Action
+from interface.actions import first_refusal
+from interface.bodies import Arm
+from interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
 from sim.skills.failures import SkillFailure
@@ -26,7 +26,7 @@ FULL_SHARE: Final = 0.999
 
 
 class WorldObject:
-    """An object of the simulator as `data.interface.facts.ObjectFacts`."""
+    """An object of the simulator as `interface.facts.ObjectFacts`."""
 
     def __init__(self, obj: ObjectInstance, body: Body) -> None:
         self._obj, self._body = obj, body
@@ -163,7 +163,7 @@ class WorldObject:
 
 
 class WorldFacts:
-    """The simulated world as `data.interface.facts.Facts`."""
+    """The simulated world as `interface.facts.Facts`."""
 
     def __init__(self, body: Body) -> None:
         self._body = body

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from data.interface.failures import FAILURES, FailureCode
-from data.interface.feedback import ActionOutcome, category_of
-from data.interface.steps import Action
+from interface.failures import FAILURES, FailureCode
+from interface.feedback import ActionOutcome, category_of
+from interface.steps import Action
 
 __all__ = ["SkillFailure", "failed", "succeeded"]
 

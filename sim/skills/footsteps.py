@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from data.files import read_cached, write_cached
-from sim.robots.build_solver import RobotKit
-from sim.robots.kinematics import root_quaternion
-from sim.robots.leg_ik import solve_legs
+from robots.build_solver import RobotKit
+from robots.kinematics import root_quaternion
+from robots.leg_ik import solve_legs
 
 __all__ = ["Footsteps", "footsteps"]
 

@@ -18,8 +18,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import Arm
-from sim.robots.spec import HandSpec
+from interface.bodies import Arm
+from robots.spec import HandSpec
 from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
 from sim.skills.reach_map import HandPose

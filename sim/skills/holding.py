@@ -7,8 +7,8 @@ held falls, and a door with a spring shuts. Paper: holding and releasing of the 
 
 from __future__ import annotations
 
-from data.interface.failures import FailureCode
-from data.interface.steps import Action
+from interface.failures import FailureCode
+from interface.steps import Action
 from sim.skills.articulate import plan_handle
 from sim.skills.body.body import Body
 from sim.skills.facts import require

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import Arm
+from interface.bodies import Arm
 from sim.skills.body.body import Body
 from sim.skills.navigation import Stance
 from sim.skills.reach import Reach, fulfils, plan_reach

@@ -17,9 +17,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import Arm
-from data.interface.failures import FailureCode
-from data.interface.steps import Action
+from interface.bodies import Arm
+from interface.failures import FailureCode
+from interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
 from sim.skills.body.ready import carrying_posture, ready_posture

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable
 from typing import TypeVar
 
-from data.interface.steps import Action
+from interface.steps import Action
 from sim.skills.body.body import Body
 
 __all__ = ["cached_plan"]

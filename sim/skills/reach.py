@@ -15,8 +15,8 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import Arm
-from data.interface.failures import FailureCode
+from interface.bodies import Arm
+from interface.failures import FailureCode
 from sim.skills.body.body import Body
 from sim.skills.body.ik import REACH_TOLERANCE_M, ArmGoal
 from sim.skills.failures import SkillFailure

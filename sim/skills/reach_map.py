@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from data.files import read_cached, write_cached
-from sim.robots.build_solver import RobotKit
-from sim.robots.kinematics import RobotModel
+from robots.build_solver import RobotKit
+from robots.kinematics import RobotModel
 
 __all__ = ["WOUND_RAD", "HandPose", "ReachMap", "reach_maps"]
 

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from data.interface.actions import exclude_each_other, first_refusal
-from data.interface.failures import FailureCode
-from data.interface.steps import Action, PlanStep
+from interface.actions import exclude_each_other, first_refusal
+from interface.failures import FailureCode
+from interface.steps import Action, PlanStep
 from sim.skills import articulate, holding, locomotion, manipulate, pouring, set_down, tools, two_arm
 from sim.skills.body.body import Body
 from sim.skills.facts import WorldFacts

@@ -13,9 +13,9 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from typing import Final
 
-from data.interface.failures import FailureCode
-from data.interface.feedback import ActionOutcome
-from data.interface.steps import Action
+from interface.failures import FailureCode
+from interface.feedback import ActionOutcome
+from interface.steps import Action
 from sim.skills.failures import SkillFailure, failed, succeeded
 
 __all__ = ["CONTROL_DT_S", "Skill", "run_skills", "wait"]

@@ -15,9 +15,9 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import PAPER_ROBOTS
-from sim.robots.build_solver import robot_kit
-from sim.robots.spec import load_robot
+from interface.bodies import PAPER_ROBOTS
+from robots.build_solver import robot_kit
+from robots.spec import load_robot
 from sim.scene.catalogue import ObjectType, load_catalogue
 from sim.scene.rooms import Furniture, load_room, room_names
 from sim.skills.navigation import NavigationMap, Rectangle

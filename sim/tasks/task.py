@@ -16,7 +16,7 @@ from typing import Any, Final, Literal
 
 from configs.validate import build
 from data.files import write_text
-from data.interface.episode import STEP_LIMIT
+from interface.episode import STEP_LIMIT
 from sim.tasks.predicates import Predicate
 
 __all__ = [

@@ -16,10 +16,10 @@ from rich.console import Console
 from rich.table import Table
 
 from configs.arguments import command, read_arguments
-from data.interface.actions import ACTIONS
-from data.interface.failures import FAILURES
+from interface.actions import ACTIONS
+from interface.failures import FAILURES
+from robots.spec import available_robots, load_robot
 from sim.interfaces.aliases import ALIASES
-from sim.robots.spec import available_robots, load_robot
 from sim.scene.catalogue import load_catalogue
 from sim.scene.rooms import load_room, room_names
 from sim.session.contingency import DIFFICULTIES, OUTCOMES

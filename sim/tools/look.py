@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs.arguments import command, read_arguments
-from data.interface.bodies import DEFAULT_ROBOT
-from data.interface.steps import Action, PlanStep
+from interface.bodies import DEFAULT_ROBOT
+from interface.steps import Action, PlanStep
+from robots.spec import available_robots, load_robot
 from sim.expert.expert import Expert
-from sim.robots.spec import available_robots, load_robot
 from sim.scene.catalogue import load_catalogue
 from sim.scene.compiler import build_type_spec
 from sim.scene.rooms import room_names

@@ -35,7 +35,7 @@ from data.motion import FPS
 from data.retarget import Retargeter
 from data.skeleton import JOINTS, PARENTS, HumanMotion, index
 from data.sources import SUFFIXES, load_file
-from sim.robots.spec import available_robots, load_robot
+from robots.spec import available_robots, load_robot
 
 __all__ = ["film", "find_clip", "main", "title_lines"]
 

@@ -23,9 +23,9 @@ from tqdm import tqdm
 
 from configs.arguments import command, read_arguments
 from configs.validate import ConfigError, allowed_values
-from data.interface.bodies import DEFAULT_ROBOT
-from data.interface.feedback import Feedback
-from data.interface.steps import ActionError, PlanStep
+from interface.bodies import DEFAULT_ROBOT
+from interface.feedback import Feedback
+from interface.steps import ActionError, PlanStep
 from sim.expert.expert import Expert
 from sim.session.session import FreePlay, Session, TaskLike
 from sim.skills.runner import CONTROL_DT_S

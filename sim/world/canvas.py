@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.gl import RenderingError
+from robots.gl import RenderingError
 
 __all__ = ["Canvas", "shared_canvas"]
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import SIDES
+from interface.bodies import SIDES
 from sim.scene.compiler import BASE_JOINTS
 from sim.scene.objects import MovingPart, ObjectInstance
 from sim.world.constraints import GraspConstraints

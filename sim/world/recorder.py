@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import KEY_BODIES, SIDES
-from sim.robots.spec import RobotSpec
+from interface.bodies import KEY_BODIES, SIDES
+from robots.spec import RobotSpec
 
 __all__ = ["FRAME_DT_S", "HISTORY_FRAMES", "MotionWindow", "Recorder"]
 

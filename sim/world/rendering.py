@@ -1,6 +1,6 @@
 """Offscreen pictures of a world: RGB, metric depth and instance segmentation of one camera at one size.
 
-The OpenGL backend is chosen in `sim.gl`: EGL unless MUJOCO_GL says otherwise, OSMesa where EGL is missing.
+The OpenGL backend is chosen in `robots.gl`: EGL unless MUJOCO_GL says otherwise, OSMesa where EGL is missing.
 Planner images have no shadows, reflections, textures or multisampling (measured on two shared CPU cores: 10 x and 3 x). Paper:
 first-person and third-person cameras of DualTHOR. Left out: camera noise and lens distortion.
 
@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.gl import RenderingError
+from robots.gl import RenderingError
 from sim.scene.catalogue import load_catalogue
 from sim.scene.surfaces import FLOOR, PLASTER, SURFACES
 from sim.world.canvas import shared_canvas

@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import SIDES
-from sim.robots.spec import RobotSpec
+from interface.bodies import SIDES
+from robots.spec import RobotSpec
 from sim.scene.catalogue import Catalogue, Part
 from sim.scene.compiler import SceneKey, compile_scene
 from sim.scene.objects import ObjectInstance, ObjectState, index_object

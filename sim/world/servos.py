@@ -10,8 +10,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import SIDES
-from sim.robots.build_solver import robot_kit
+from interface.bodies import SIDES
+from robots.build_solver import robot_kit
 from sim.scene.compiler import BASE_JOINTS
 from sim.world.recorder import Recorder
 from sim.world.scene_state import SceneState, WorldError

@@ -18,9 +18,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import SIDES
-from sim.robots.build_solver import robot_kit
-from sim.robots.spec import RobotSpec
+from interface.bodies import SIDES
+from robots.build_solver import robot_kit
+from robots.spec import RobotSpec
 from sim.scene.catalogue import load_catalogue
 from sim.scene.compiler import BASE_JOINTS, TIMESTEP_S
 from sim.scene.objects import ObjectInstance, ObjectPlacement, Placement
@@ -58,7 +58,7 @@ class World:
     """One robot in one furnished room.
 
     Args:
-        robot: description from `sim.robots.spec.load_robot`, None for a room alone.
+        robot: description from `robots.spec.load_robot`, None for a room alone.
         room: room name.
         placements: movable objects, carriers before what they carry; None takes the room's own default objects.
         states: start states of furniture by id (`{"Fridge_1": {"isOpen": True}}`).

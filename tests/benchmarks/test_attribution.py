@@ -10,8 +10,8 @@ import pytest
 from benchmarks import attribution as validation
 from benchmarks.attribution import main, validate
 from benchmarks.fault_episodes import Scripted, ScriptedResult
-from data.interface.episode import EpisodeRecord, Outcome
-from data.interface.failures import FailureCategory
+from interface.episode import EpisodeRecord, Outcome
+from interface.failures import FailureCategory
 
 NAVIGATION, BODY, LOGICAL = FailureCategory
 

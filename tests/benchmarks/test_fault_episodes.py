@@ -11,10 +11,10 @@ import pytest
 from benchmarks.attribution import validate
 from benchmarks.fault_episodes import Cell, CellRunner, cells, drawn, read_plans
 from benchmarks.fault_injection import CAUSES, LATE_SLIPS, SLIPS, FaultyPlanner
-from data.interface.actions import ActionKind
-from data.interface.episode import Outcome
-from data.interface.failures import FailureCategory
-from data.interface.steps import PlanStep
+from interface.actions import ActionKind
+from interface.episode import Outcome
+from interface.failures import FailureCategory
+from interface.steps import PlanStep
 from proprio_mllm.evaluation.privileged import PrivilegedPlanner
 from proprio_mllm.planners.protocol import Planner, TaskInfo
 from sim.tasks.task import load_benchmark

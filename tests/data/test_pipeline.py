@@ -6,9 +6,9 @@ import pytest
 
 from configs.schema.data import DataConfig, GateConfig, ReplayConfig
 from data.humanml3d import DatasetError
-from data.interface.motion import Motion
 from data.pipeline import Pictures, build_clips, dataset_folder
 from data.shards import ShardError, ShardReader, decode_motion, encode_png
+from interface.motion import Motion
 
 CFG = DataConfig(clips=4, part_size=2, workers=1, robots=("x1",))
 

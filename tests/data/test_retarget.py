@@ -21,7 +21,7 @@ from data.retarget import MAX_JOINT_VELOCITY, Retargeted, Retargeter
 from data.retarget_report import PHYSICS, measure, table
 from data.retarget_report import main as report
 from data.skeleton import Caption, HumanMotion
-from sim.robots.spec import load_robot
+from robots.spec import load_robot
 
 ROBOTS = ("h1", "x1")
 #: walk, side-step, reach low with both, wave

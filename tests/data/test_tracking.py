@@ -7,11 +7,11 @@ import pinocchio as pin
 import pytest
 
 from data.generator import generate_clip
-from data.interface.motion import Motion
 from data.retarget import Retargeter
 from data.skeleton import HumanMotion
 from data.tracking import Tracker, Tracking
-from sim.robots.spec import load_robot
+from interface.motion import Motion
+from robots.spec import load_robot
 
 ROBOTS = ("h1", "x1")
 

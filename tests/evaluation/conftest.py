@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from data.interface.failures import FailureCategory
-from data.interface.feedback import ActionOutcome, Feedback
-from data.interface.observation import Camera, Observation, Proprioception
-from data.interface.steps import Action, PlanStep
+from interface.failures import FailureCategory
+from interface.feedback import ActionOutcome, Feedback
+from interface.observation import Camera, Observation, Proprioception
+from interface.steps import Action, PlanStep
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, GoalReport, Stats
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, parse_reply
 from sim.tasks.predicates import Predicate

@@ -11,8 +11,8 @@ import pytest
 
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
-from data.interface.episode import EpisodeRecord, Outcome
-from data.interface.observation import Observation
+from interface.episode import EpisodeRecord, Outcome
+from interface.observation import Observation
 from proprio_mllm.evaluation.asking import AskingPlanner, ModelDesk, answer_all, batch_planner
 from proprio_mllm.evaluation.pool import run_here
 from proprio_mllm.evaluation.run import evaluate

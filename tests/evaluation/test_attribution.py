@@ -7,10 +7,10 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from data.interface.actions import ActionKind
-from data.interface.failures import FailureCategory, FailureCode
-from data.interface.feedback import category_of
-from data.interface.steps import Action
+from interface.actions import ActionKind
+from interface.failures import FailureCategory, FailureCode
+from interface.feedback import category_of
+from interface.steps import Action
 from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, Deciding, attribute, deciding_failure, unmet_objects
 from sim.tasks.task import load_benchmark
 

@@ -13,7 +13,7 @@ from configs.schema.backend import BackendConfig
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
 from data.code_files import CodeFileError
-from data.interface.episode import EpisodeRecord, Outcome
+from interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest
 from proprio_mllm.backends.server import ChatServer
 from proprio_mllm.evaluation.run import _ready, config_hash, evaluate, run_folder

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from configs.schema.collect import CollectConfig
-from data.interface.observation import Observation
-from data.interface.steps import PlanStep
 from data.shards import ShardReader
+from interface.observation import Observation
+from interface.steps import PlanStep
 from proprio_mllm.evaluation import dagger
 from proprio_mllm.evaluation.dagger import collect_dagger
 from proprio_mllm.training.rollouts import DaggerRequest

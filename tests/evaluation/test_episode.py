@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from data.interface.episode import Outcome
-from data.interface.failures import FailureCategory
+from interface.episode import Outcome
+from interface.failures import FailureCategory
 from proprio_mllm.evaluation.episode import Limits, run_episode
 from proprio_mllm.evaluation.ledger import Ledger, read_ledger
 from proprio_mllm.planners.protocol import Usage

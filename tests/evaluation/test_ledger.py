@@ -7,8 +7,8 @@ import json
 
 import pytest
 
-from data.interface.episode import Outcome
-from data.interface.failures import FailureCategory
+from interface.episode import Outcome
+from interface.failures import FailureCategory
 from proprio_mllm.evaluation.episode import Limits, run_episode
 from proprio_mllm.evaluation.ledger import Ledger, LedgerError, key_of, read_ledger, scored
 from proprio_mllm.evaluation.seeds import episode_seed, stream

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from configs.schema.collect import CollectConfig
-from data.interface.steps import PlanStep
 from data.shards import ShardReader
+from interface.steps import PlanStep
 from proprio_mllm.evaluation import lessons
 from proprio_mllm.evaluation.dagger import collect_lessons
 from proprio_mllm.evaluation.lessons import Lessons, WordsOnly

@@ -15,7 +15,7 @@ import pytest
 import configs
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
-from data.interface.episode import STEP_LIMIT, Outcome
+from interface.episode import STEP_LIMIT, Outcome
 from proprio_mllm.evaluation import run as running
 from proprio_mllm.evaluation.ledger import Ledger, LedgerError, read_ledger
 from proprio_mllm.evaluation.run import config_hash, evaluate, plan_episodes, run_folder, select_tasks, weights_digest

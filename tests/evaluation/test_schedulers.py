@@ -17,8 +17,8 @@ import pytest
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
 from data.cluster import import_ray, ray_instance
-from data.interface.episode import EpisodeRecord
-from data.interface.observation import Camera, Observation, Proprioception
+from interface.episode import EpisodeRecord
+from interface.observation import Camera, Observation, Proprioception
 from proprio_mllm.evaluation.ray_pool import ray_model, run_ray_jobs
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.evaluation.serving import model_process

@@ -9,7 +9,7 @@ import pytest
 
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
-from data.interface.episode import Outcome
+from interface.episode import Outcome
 from proprio_mllm.evaluation.privileged import ExpertPlanner
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.evaluation.sessions import open_session

@@ -13,9 +13,9 @@ from configs.compose import compose
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
 from configs.validate import ConfigError, build
-from data.interface.observation import HistoryItem
-from data.interface.sightings import Shown
-from data.interface.symbolic import events_of
+from interface.observation import HistoryItem
+from interface.sightings import Shown
+from interface.symbolic import events_of
 from proprio_mllm.evaluation.episode import Limits, run_episode
 from proprio_mllm.evaluation.naming import options_of
 from proprio_mllm.evaluation.run import config_hash

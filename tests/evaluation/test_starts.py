@@ -12,7 +12,7 @@ from configs.schema.robot import RobotConfig
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.evaluation.seeds import episode_seed, stream
 from proprio_mllm.evaluation.starts import CLEARANCE_M, random_start, started
-from sim.robots.spec import load_robot
+from robots.spec import load_robot
 from sim.skills.obstacles import navigation_map
 from sim.tasks.task import Task, load_benchmark, write_tasks
 from sim.world.world import World, WorldError

@@ -14,8 +14,8 @@ import pytest
 from configs.compose import compose
 from configs.schema.eval import EvalConfig
 from configs.validate import build
-from data.interface.episode import Outcome
-from data.interface.symbolic import Event, events_of
+from interface.episode import Outcome
+from interface.symbolic import Event, events_of
 from proprio_mllm.evaluation.lessons import WordsOnly
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner

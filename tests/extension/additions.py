@@ -44,7 +44,7 @@ SKILL = Addition(
     "tap",
     (
         Edit(
-            "data/interface/actions.py",
+            "interface/actions.py",
             """    ActionSpec(
         "Tap",
         ActionKind.ARM,
@@ -64,8 +64,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from data.interface.failures import FailureCode
-from data.interface.steps import Action
+from interface.failures import FailureCode
+from interface.steps import Action
 from sim.skills.articulate import plan_press
 from sim.skills.body.body import Body
 from sim.skills.facts import require
@@ -104,7 +104,7 @@ def tap(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
         Edit("sim/skills/registry.py", '    "Tap": ArmSkill(tap.tap, tap.assess_tap),\n', '    "UseUp": ArmSkill('),
         Edit(
             "tests/sim/skills/test_tap.py",
-            """from data.interface.actions import ACTIONS
+            """from interface.actions import ACTIONS
 
 
 def test_tap_is_an_action() -> None:
@@ -113,9 +113,9 @@ def test_tap_is_an_action() -> None:
         ),
     ),
     """
-from data.interface.actions import ACTIONS
-from data.interface.manual import action_manual
-from data.interface.steps import PlanStep
+from interface.actions import ACTIONS
+from interface.manual import action_manual
+from interface.steps import PlanStep
 from proprio_mllm.report.sft import plan_prompt
 from sim.session.session import FreePlay, Session
 from sim.tools.catalogue import inventory
@@ -147,7 +147,7 @@ assert "ok" in codes, codes
 assert set(codes) <= {"ok", *ACTIONS["Tap"].codes}, codes
 print("works")
 """,
-    ("tests/data/interface", "tests/sim/collection/test_text_world.py", "tests/planners/chat/dag_plan/test_checks.py"),
+    ("tests/interface", "tests/sim/collection/test_text_world.py", "tests/planners/chat/dag_plan/test_checks.py"),
 )
 
 QUANTIZER = Addition(

@@ -1,4 +1,4 @@
-"""Failure codes and robots are named in `data.interface` and the configurations; elsewhere nobody spells them."""
+"""Failure codes and robots are named in `interface` and the configurations; elsewhere nobody spells them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-from data.interface.bodies import PAPER_ROBOTS
-from data.interface.failures import INVALID_OUTPUT, FailureCode
+from interface.bodies import PAPER_ROBOTS
+from interface.failures import INVALID_OUTPUT, FailureCode
 
 ROOT = Path(__file__).parents[2]
 #: AI2-THOR's own error code of this name, and the makers of the robots' assets.
 ALLOWED = {("sim/interfaces/controller.py", "ReceptacleFull")}
-MAKERS = ("sim/robots/build_h1.py", "sim/robots/build_x1.py")
+MAKERS = ("robots/build_h1.py", "robots/build_x1.py")
 #: Words that are codes and something else, too.
 ORDINARY = {"Empty"}
 
@@ -27,9 +27,9 @@ def strings(path: Path) -> Iterator[str]:
 def test_codes_and_robots_are_spelled_once() -> None:
     names = {code.value for code in FailureCode} - ORDINARY | {INVALID_OUTPUT, *PAPER_ROBOTS}
     found = set()
-    for package in ("data", "sim", "proprio_mllm"):
+    for package in ("interface", "robots", "data", "sim", "proprio_mllm"):
         for path in (ROOT / package).rglob("*.py"):
             place = str(path.relative_to(ROOT))
-            if not place.startswith("data/interface/") and place not in MAKERS:
+            if not place.startswith("interface/") and place not in MAKERS:
                 found |= {(place, text) for text in strings(path) if text in names}
     assert found <= ALLOWED, sorted(found - ALLOWED)

@@ -16,7 +16,7 @@ from tests.extension.additions import QUANTIZER, SKILL, STAGE, Addition
 from tests.third_robot import write_third_robot
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("configs", "data", "sim", "proprio_mllm", "tests")
+PACKAGES = ("configs", "interface", "robots", "data", "sim", "proprio_mllm", "tests")
 
 
 def touched(row: str, name: str) -> set[str]:
@@ -61,7 +61,7 @@ def test_what_the_map_lists_is_enough(addition: Addition, tmp_path: Path) -> Non
     root = tmp_path / "checkout"
     for package in PACKAGES:
         shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__", "*.stl", "*.obj"))
-    for mesh in (path for path in (ROOT / "sim").rglob("*") if path.suffix in (".stl", ".obj")):
+    for mesh in (path for path in (ROOT / "robots").rglob("*") if path.suffix in (".stl", ".obj")):
         copy = root / mesh.relative_to(ROOT)
         copy.parent.mkdir(parents=True, exist_ok=True)
         copy.symlink_to(mesh)

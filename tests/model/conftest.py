@@ -19,7 +19,7 @@ from configs.schema.model import (
     TinyTextConfig,
     TinyVisionConfig,
 )
-from data.interface.observation import Camera
+from interface.observation import Camera
 from proprio_mllm.model.batch import Collator, Example, View
 from proprio_mllm.model.building import build_model, build_processor
 from proprio_mllm.model.modeling import ProprioMLLM

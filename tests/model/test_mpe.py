@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from data.interface.bodies import KEY_BODIES
-from data.interface.observation import Camera
+from interface.bodies import KEY_BODIES
+from interface.observation import Camera
 from proprio_mllm.model.geometry import arm_length_m, body_point_in_pelvis, centroid, project, unproject
 from proprio_mllm.model.mpe import MPE_MODES, SignEmbedding, degenerate, position_ids, relative_cells, visual_positions
 
@@ -19,7 +19,7 @@ def _camera(height_m: float = 0.6) -> Camera:
 
 
 def test_key_bodies_are_the_robots():
-    spec = pytest.importorskip("sim.robots.spec")
+    spec = pytest.importorskip("robots.spec")
     assert tuple(spec.KEY_BODIES) == KEY_BODIES
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from data.interface.steps import Action, PlanStep
+from interface.steps import Action, PlanStep
 from proprio_mllm.model import prompts, questions
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.chat import Message, encode, render, to_chat

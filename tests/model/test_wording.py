@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from data.interface.observation import HistoryItem
-from data.interface.sightings import Shown, Sightings
-from data.interface.steps import PlanStep
+from interface.observation import HistoryItem
+from interface.sightings import Shown, Sightings
+from interface.steps import PlanStep
 from proprio_mllm.model.wording import answer_words, id_words, log_words, prefix_words, read_step, state_words
 
 ROOM = ("CounterTop_1", "TVStand_1", "Fridge_2")

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from data.interface.steps import PlanStep
 from data.shards import ShardWriter, encode_png
+from interface.steps import PlanStep
 
 FURNITURE = ("CounterTop_1", "Drawer_1", "Fridge_1", "LightSwitch_1")
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data.interface.actions import ACTIONS
-from data.interface.belief import Belief
-from data.interface.observation import HistoryItem
-from data.interface.steps import PlanStep
+from interface.actions import ACTIONS
+from interface.belief import Belief
+from interface.observation import HistoryItem
+from interface.steps import PlanStep
 from proprio_mllm.model.wording import END, answer_words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
 

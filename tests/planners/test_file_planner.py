@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data.code_files import CodeFileError, source_digest
-from data.interface.observation import Camera, Observation, Proprioception
+from interface.observation import Camera, Observation, Proprioception
 from proprio_mllm.planners.file_planner import load_planner
 from proprio_mllm.planners.protocol import TaskInfo
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from configs.schema.eval import PlannerConfig
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
-from data.interface.steps import PlanStep
+from interface.feedback import Feedback
+from interface.observation import Observation
+from interface.steps import PlanStep
 from proprio_mllm.backends.protocol import ChatRequest
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, GoalReport, Limits, RunnableSession, Stats, run_episode
 from proprio_mllm.evaluation.privileged import ExpertPlanner

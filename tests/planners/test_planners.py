@@ -11,9 +11,9 @@ import pytest
 from configs.compose import CONFIG_DIR, compose
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.validate import build
-from data.interface.actions import ACTIONS
-from data.interface.observation import Camera, Observation, Proprioception
-from data.interface.steps import PlanStep
+from interface.actions import ACTIONS
+from interface.observation import Camera, Observation, Proprioception
+from interface.steps import PlanStep
 from proprio_mllm.planners.protocol import Planner, TaskInfo, WeightsError, check_weights, parse_reply
 from proprio_mllm.planners.random_planner import RandomPlanner
 from proprio_mllm.planners.registry import CHAT_PLANNERS, PLANNERS, make_planner

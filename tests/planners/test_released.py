@@ -15,7 +15,7 @@ from configs.compose import compose
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
 from configs.validate import build
-from data.interface.observation import Observation
+from interface.observation import Observation
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.protocol import TaskInfo

@@ -13,9 +13,9 @@ from transformers import DynamicCache
 from configs.compose import compose
 from configs.schema.train import TrainConfig
 from configs.validate import build
-from data.interface.observation import Camera, HistoryItem, Observation, Proprioception
-from data.interface.sightings import Shown
-from data.interface.steps import PlanStep
+from interface.observation import Camera, HistoryItem, Observation, Proprioception
+from interface.sightings import Shown
+from interface.steps import PlanStep
 from proprio_mllm.evaluation.lessons import Lessons, WordsOnly
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import build_model, build_processor, save_model

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data.interface.episode import EpisodeRecord, Outcome
-from data.interface.failures import FailureCategory
+from interface.episode import EpisodeRecord, Outcome
+from interface.failures import FailureCategory
 from proprio_mllm.evaluation.ledger import Ledger
 from tests.report.ledgers import scripted_run
 

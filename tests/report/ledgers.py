@@ -10,8 +10,8 @@ from typing import Any
 
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
-from data.interface.episode import EpisodeRecord, Outcome
-from data.interface.failures import FailureCategory
+from interface.episode import EpisodeRecord, Outcome
+from interface.failures import FailureCategory
 from proprio_mllm.evaluation.ledger import Ledger
 from proprio_mllm.evaluation.run import evaluate, plan_episodes
 from sim.tasks.predicates import Predicate

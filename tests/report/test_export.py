@@ -11,10 +11,10 @@ import pytest
 from datasets import load_from_disk
 
 from data.files import file_hash
-from data.interface.observation import HistoryItem
-from data.interface.steps import PlanStep
 from data.motion import N_FEATURES
 from data.shards import decode_motion
+from interface.observation import HistoryItem
+from interface.steps import PlanStep
 from proprio_mllm.report.export import ExportConfig as Config
 from proprio_mllm.report.export import ExportError, export, main, read_sft, read_traces
 from proprio_mllm.report.html import run_data

@@ -10,8 +10,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from configs.schema.eval import ExperimentConfig
-from data.interface.episode import EpisodeRecord, Outcome
-from data.interface.failures import FailureCategory
+from interface.episode import EpisodeRecord, Outcome
+from interface.failures import FailureCategory
 from proprio_mllm.report import figures
 from proprio_mllm.report.figures import failure_figure, plot_failures, task_distribution
 from proprio_mllm.report.summary import Row, rows_of

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data.interface.episode import Outcome
+from interface.episode import Outcome
 from proprio_mllm.evaluation.ledger import Ledger
 from proprio_mllm.report.frames import act_out, episode_id
 from proprio_mllm.report.html import main, page, run_data

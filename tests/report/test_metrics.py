@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from data.interface.episode import Outcome
+from interface.episode import Outcome
 from proprio_mllm.evaluation.run import task_key
 from proprio_mllm.report.metrics import Certificate, References, extras_of, first_tries, path_efficiency, recoveries
 from proprio_mllm.report.references import read_certificates, references_of

@@ -13,8 +13,8 @@ import yaml
 from rich.console import Console
 
 from configs.schema.eval import ExperimentConfig
-from data.interface.episode import Outcome
-from data.interface.failures import FailureCategory
+from interface.episode import Outcome
+from interface.failures import FailureCategory
 from proprio_mllm.backends.spending import Spending
 from proprio_mllm.evaluation.ledger import Ledger
 from proprio_mllm.report import paper

@@ -18,7 +18,7 @@ from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.report import tokenizer as report
 from proprio_mllm.report.tokenizer import evaluate_tokenizer, main, table, windows_of
 from proprio_mllm.training.sources import Clips, held_out
-from sim.robots.spec import load_robot
+from robots.spec import load_robot
 
 FRAMES = 32
 

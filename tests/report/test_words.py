@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from data.interface.failures import FAILURES, FailureCode
+from interface.failures import FAILURES, FailureCode
 from proprio_mllm.report.words import code_in_words, margins_in_words
 
 

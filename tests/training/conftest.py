@@ -23,9 +23,9 @@ from configs.schema.model import (
 )
 from configs.schema.train import TrainConfig
 from configs.validate import build
-from data.interface.observation import Camera, Observation, Proprioception
 from data.motion import N_FEATURES
 from data.shards import ShardReader, ShardWriter, encode_png
+from interface.observation import Camera, Observation, Proprioception
 from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.training.pipeline import Pipeline
 from proprio_mllm.training.rollouts import DaggerRequest, RolloutRequest, rollout_row

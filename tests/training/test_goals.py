@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from data.interface.observation import HistoryItem
+from interface.observation import HistoryItem
 from proprio_mllm.training.goals import natural_name, parse_ids, relabel, verbs_of
 from proprio_mllm.training.states import states_from_log
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import KEY_BODIES, SIDES
 from data.motion import HAND_OPENING, KEY_BODY_COUNT, N_FEATURES
+from interface.bodies import KEY_BODIES, SIDES
 from proprio_mllm.training.posture import in_other_postures
 
 BONES = [

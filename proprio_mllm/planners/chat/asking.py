@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 
 from pydantic import BaseModel
 
-from data.interface.steps import PlanStep
+from interface.steps import PlanStep
 from proprio_mllm.backends.protocol import Backend, ChatImage, ChatMessage, ChatRequest
 from proprio_mllm.planners.chat.replies import ReplyError, read_reply
 from proprio_mllm.planners.protocol import PlannerReply, Usage, parse_reply

@@ -21,9 +21,9 @@ from typing import Final
 
 import numpy as np
 
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
-from data.interface.steps import Action, ActionError, PlanStep
+from interface.feedback import Feedback
+from interface.observation import Observation
+from interface.steps import Action, ActionError, PlanStep
 from proprio_mllm.backends.protocol import Backend, ChatImage
 from proprio_mllm.planners.chat.asking import Answer, Asker
 from proprio_mllm.planners.chat.embedding import Embedder

@@ -11,10 +11,10 @@ from collections import deque
 
 import numpy as np
 
-from data.interface.feedback import Feedback
-from data.interface.manual import action_manual, code_manual
-from data.interface.observation import Observation
-from data.interface.steps import PlanStep
+from interface.feedback import Feedback
+from interface.manual import action_manual, code_manual
+from interface.observation import Observation
+from interface.steps import PlanStep
 from proprio_mllm.backends.protocol import Backend, ChatImage
 from proprio_mllm.planners.chat.asking import Answer, Asker
 from proprio_mllm.planners.chat.options import ChatOptions

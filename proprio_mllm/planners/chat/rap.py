@@ -22,8 +22,8 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
+from interface.feedback import Feedback
+from interface.observation import Observation
 from proprio_mllm.backends.protocol import Backend, ChatImage
 from proprio_mllm.planners.chat.asking import Answer, Asker
 from proprio_mllm.planners.chat.options import ChatOptions

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from data.interface.feedback import Feedback
-from data.interface.observation import HistoryItem, Observation
+from interface.feedback import Feedback
+from interface.observation import HistoryItem, Observation
 from proprio_mllm.backends.protocol import ChatImage
 from proprio_mllm.planners.chat.asking import REFLECTION, Answer, Asker
 from proprio_mllm.planners.chat.replies import Reflection

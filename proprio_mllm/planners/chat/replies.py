@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from data.interface.steps import ActionError, PlanStep
+from interface.steps import ActionError, PlanStep
 from proprio_mllm.backends.protocol import ChatReply
 
 __all__ = ["Plan", "Reflection", "ReplyError", "read_json", "read_reply", "read_steps"]

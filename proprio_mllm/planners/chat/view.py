@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from data.interface.bodies import KEY_BODIES
-from data.interface.observation import HistoryItem, Observation, Proprioception
 from data.motion import HAND_OPENING, OPEN_HAND, PELVIS_HEIGHT
+from interface.bodies import KEY_BODIES
+from interface.observation import HistoryItem, Observation, Proprioception
 from proprio_mllm.backends.protocol import ChatImage
 
 __all__ = ["body_text", "encoded", "log_text", "scene_text"]

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, TypeGuard
 
-from data.interface.actions import ACTIONS, ActionKind, bringing_about
-from data.interface.belief import Belief
-from data.interface.bodies import Arm
-from data.interface.effects import Condition
-from data.interface.failures import FailureCode
-from data.interface.steps import Action
+from interface.actions import ACTIONS, ActionKind, bringing_about
+from interface.belief import Belief
+from interface.bodies import Arm
+from interface.effects import Condition
+from interface.failures import FailureCode
+from interface.steps import Action
 from proprio_mllm.planners.scripted.words import Mention, type_of
 
 __all__ = ["Job", "Want", "holds", "next_jobs"]

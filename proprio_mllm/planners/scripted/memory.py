@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from typing import Final
 
-from data.interface.belief import Belief
-from data.interface.effects import Condition
-from data.interface.failures import FailureCode
-from data.interface.sightings import Sightings
-from data.interface.steps import Action
+from interface.belief import Belief
+from interface.effects import Condition
+from interface.failures import FailureCode
+from interface.sightings import Sightings
+from interface.steps import Action
 from proprio_mllm.planners.furniture import CONTAINERS, SEATS, SURFACES
 from proprio_mllm.planners.scripted.words import Mention, candidates, type_of
 

@@ -15,15 +15,15 @@ from typing import Final
 
 import numpy as np
 
-from data.interface.actions import ACTIONS, ActionKind
-from data.interface.belief import ARM_SPECIFIC, Belief
-from data.interface.bodies import Arm
-from data.interface.effects import Grasp
-from data.interface.failures import FailureCode
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
-from data.interface.sightings import Seen
-from data.interface.steps import Action, PlanStep
+from interface.actions import ACTIONS, ActionKind
+from interface.belief import ARM_SPECIFIC, Belief
+from interface.bodies import Arm
+from interface.effects import Grasp
+from interface.failures import FailureCode
+from interface.feedback import Feedback
+from interface.observation import Observation
+from interface.sightings import Seen
+from interface.steps import Action, PlanStep
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 from proprio_mllm.planners.scripted.instruction import TOOLS, Goal, read_goals
 from proprio_mllm.planners.scripted.jobs import Job, Want, next_jobs

@@ -15,7 +15,8 @@ from typing import Any, Final
 
 from configs.schema.checks import is_loopback
 from data.http_limits import LimitedHandler, LimitedServer, body_length, has_left
-from data.interface.bodies import DEFAULT_ROBOT
+from interface.bodies import DEFAULT_ROBOT
+from robots.spec import available_robots
 from sim.interfaces.remote.protocol import VERSION, ProtocolError, dumps, images_of, loads
 from sim.interfaces.remote.worlds import (
     CONTROLLER_ARGUMENTS,
@@ -25,7 +26,6 @@ from sim.interfaces.remote.worlds import (
     WorldRefusedError,
     Worlds,
 )
-from sim.robots.spec import available_robots
 
 __all__ = ["RemoteServer", "ServerConfig"]
 

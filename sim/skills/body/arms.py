@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import Arm
-from sim.robots.build_solver import RobotKit
+from interface.bodies import Arm
+from robots.build_solver import RobotKit
 from sim.skills.body.clearance import ClearanceProbe
 from sim.skills.body.ik import BothGoal
 from sim.skills.body.joints import JointMap

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robots.build_solver import RobotKit
+from robots.build_solver import RobotKit
 from sim.skills.body.joints import JointMap
 from sim.skills.body.posture import Posture
 from sim.skills.footsteps import footsteps

@@ -12,9 +12,9 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
-from data.interface.bodies import Arm
-from data.interface.steps import Action
-from sim.robots.build_solver import robot_kit
+from interface.bodies import Arm
+from interface.steps import Action
+from robots.build_solver import robot_kit
 from sim.scene.objects import ObjectInstance
 from sim.skills.body.arms import Arms
 from sim.skills.body.base import Base

@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import Arm
-from sim.robots.build_solver import RobotKit
+from interface.bodies import Arm
+from robots.build_solver import RobotKit
 from sim.scene.objects import MovingPart, ObjectInstance
 from sim.skills.body.joints import JointMap
 from sim.skills.body.posture import Posture

@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import Arm
-from sim.robots.spec import RobotSpec
+from interface.bodies import Arm
+from robots.spec import RobotSpec
 from sim.skills.body.joints import JointMap
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.world.world import World

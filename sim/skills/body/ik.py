@@ -15,11 +15,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import Arm
-from sim.robots.arm_ik import PerArmSolver
-from sim.robots.build_solver import RobotKit
-from sim.robots.self_collision import SELF_TOUCH_M
-from sim.robots.solver import ReachTarget
+from interface.bodies import Arm
+from robots.arm_ik import PerArmSolver
+from robots.build_solver import RobotKit
+from robots.self_collision import SELF_TOUCH_M
+from robots.solver import ReachTarget
 from sim.skills.body.joints import JointMap
 from sim.skills.body.posture import Posture
 from sim.skills.body.ready import ready_posture

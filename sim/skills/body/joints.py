@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import Arm
-from sim.robots.spec import RobotSpec
+from interface.bodies import Arm
+from robots.spec import RobotSpec
 from sim.scene.compiler import BASE_JOINTS
 
 __all__ = ["JointMap"]

@@ -8,10 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import Arm
-from sim.robots.arm_ik import PerArmSolver
-from sim.robots.build_solver import RobotKit
-from sim.robots.solver import ReachTarget
+from interface.bodies import Arm
+from robots.arm_ik import PerArmSolver
+from robots.build_solver import RobotKit
+from robots.solver import ReachTarget
 from sim.skills.reach_map import HandPose, reach_maps
 
 __all__ = ["carrying_posture", "ready_posture"]

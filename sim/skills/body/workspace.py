@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data.interface.bodies import Arm
-from sim.robots.build_solver import RobotKit
+from interface.bodies import Arm
+from robots.build_solver import RobotKit
 from sim.scene.objects import ObjectInstance
 from sim.skills.body.posture import Posture
 from sim.skills.navigation import NavigationMap

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from data.interface.failures import FailureCategory
-from data.interface.feedback import ActionOutcome, Feedback
-from data.interface.observation import Camera, HistoryItem, Observation, Proprioception
-from data.interface.steps import PlanStep
+from interface.failures import FailureCategory
+from interface.feedback import ActionOutcome, Feedback
+from interface.observation import Camera, HistoryItem, Observation, Proprioception
+from interface.steps import PlanStep
 from proprio_mllm.backends.protocol import ChatReply, ChatRequest
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data.interface.steps import PlanStep
+from interface.steps import PlanStep
 from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest
 from proprio_mllm.planners.chat.embedding import SentenceEmbedder
 from proprio_mllm.planners.chat.llm_planner import LlmPlanner, example_text, with_known_names

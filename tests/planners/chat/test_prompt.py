@@ -7,10 +7,10 @@ import io
 import numpy as np
 from PIL import Image
 
-from data.interface.actions import ACTIONS
-from data.interface.failures import FailureCode
-from data.interface.manual import action_manual, code_manual
-from data.interface.observation import HistoryItem
+from interface.actions import ACTIONS
+from interface.failures import FailureCode
+from interface.manual import action_manual, code_manual
+from interface.observation import HistoryItem
 from proprio_mllm.planners.chat.role import role
 from proprio_mllm.planners.chat.view import body_text, encoded, log_text, scene_text
 from tests.planners.chat.script import observation

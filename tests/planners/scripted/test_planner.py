@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from configs.schema.robot import RobotConfig
-from data.interface.belief import UNKNOWN, Belief
-from data.interface.bodies import Arm
-from data.interface.effects import Condition
-from data.interface.episode import Outcome
-from data.interface.observation import Camera, HistoryItem, Observation, Proprioception
+from interface.belief import UNKNOWN, Belief
+from interface.bodies import Arm
+from interface.effects import Condition
+from interface.episode import Outcome
+from interface.observation import Camera, HistoryItem, Observation, Proprioception
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, Limits, run_episode
 from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.protocol import Planner, TaskInfo

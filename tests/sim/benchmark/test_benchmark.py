@@ -5,7 +5,7 @@ from collections import Counter
 
 import pytest
 
-from data.interface.bodies import PAPER_ROBOTS
+from interface.bodies import PAPER_ROBOTS
 from sim.benchmark.certificates import certificates_text, load_certificates, time_limit_of
 from sim.benchmark.commands import main, rebuild
 from sim.benchmark.composition import COMPOSITION

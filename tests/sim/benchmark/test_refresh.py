@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from data.interface.bodies import PAPER_ROBOTS
+from interface.bodies import PAPER_ROBOTS
 from sim.benchmark import commands
 from sim.benchmark.certificates import Certificate, load_certificates
 from sim.benchmark.commands import main, stale_note

@@ -8,11 +8,11 @@ import pytest
 from configs.arguments import read_arguments
 from configs.schema.collect import CollectConfig
 from configs.validate import ConfigError
-from data.interface.bodies import Arm
-from data.interface.observation import HistoryItem, Observation
-from data.interface.steps import Action, PlanStep
 from data.motion import N_FEATURES
 from data.shards import ShardReader, decode_depth, decode_png, decode_segmentation
+from interface.bodies import Arm
+from interface.observation import HistoryItem, Observation
+from interface.steps import Action, PlanStep
 from sim.collection.collect import collect, main, parts_of, rows_of_part
 from sim.collection.demonstrations import foreseen, perturbed, run_episode, run_lesson
 from sim.collection.view_sampling import type_names

@@ -5,12 +5,12 @@ import pytest
 
 from configs.schema.data import ReplayConfig
 from data.generator import generate_clip
-from data.interface.motion import Motion
 from data.motion import decode_key_bodies, heading_to_world, world_to_heading
 from data.retarget import Retargeter
 from data.shards import decode_depth, decode_png
+from interface.motion import Motion
+from robots.spec import load_robot
 from sim.collection.replay import picture_frames, place_path, replay_clip, set_frame
-from sim.robots.spec import load_robot
 from sim.skills.obstacles import navigation_map
 from sim.world.world import World
 

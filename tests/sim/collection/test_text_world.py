@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from data.interface.actions import ACTIONS
-from data.interface.observation import HistoryItem
-from data.interface.steps import Action, PlanStep
+from interface.actions import ACTIONS
+from interface.observation import HistoryItem
+from interface.steps import Action, PlanStep
 from proprio_mllm.evaluation.lessons import WordsOnly
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
+from robots.spec import load_robot
 from sim.collection.text_world import TextWorld
-from sim.robots.spec import load_robot
 from sim.tasks.families import FAMILIES, draw
 from sim.tasks.sample import scene_of
 

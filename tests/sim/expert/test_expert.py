@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from data.interface.steps import Action, PlanStep
+from interface.steps import Action, PlanStep
 from sim.expert.expert import Expert
 from sim.session.session import Session
 from sim.tasks.task import load_benchmark

@@ -2,7 +2,7 @@
 
 import pytest
 
-from data.interface.bodies import Arm
+from interface.bodies import Arm
 from sim.expert.jobs import Facts, Job, pending_leaves, plan_jobs
 from sim.tasks.predicates import Predicate
 

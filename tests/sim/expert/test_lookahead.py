@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from data.interface.bodies import Arm
-from data.interface.steps import Action
+from interface.bodies import Arm
+from interface.steps import Action
 from sim.expert.expert import Expert
 from sim.expert.lookahead import Rehearsal
 from sim.session.session import Session

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data.interface.bodies import Arm
-from data.interface.steps import Action
+from interface.bodies import Arm
+from interface.steps import Action
 from sim.interfaces.controller import Controller
 from sim.interfaces.poses import random_placements
 from sim.world.world import World, WorldError
@@ -98,7 +98,7 @@ def test_random_spawn_leaves_out_what_is_excluded() -> None:
 
 
 def test_teleport_takes_along_what_is_held() -> None:
-    from sim.robots.spec import load_robot
+    from robots.spec import load_robot
 
     world = World(load_robot("h1"), "kitchen_1")
     hand = world.servos.grasp_pose("left")

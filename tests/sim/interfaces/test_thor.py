@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from data.interface.bodies import Arm
+from interface.bodies import Arm
 from sim.interfaces.thor import REFUSED, Controller, from_thor, rotation_to_thor, to_thor, yaw_from_thor, yaw_to_thor
 
 

@@ -10,8 +10,8 @@ from configs.assets import ASSETS_VARIABLE
 from configs.compose import compose
 from configs.schema.eval import EvalConfig
 from configs.validate import ConfigError, build
-from data.interface.steps import PlanStep
-from sim.robots.spec import available_robots, load_robot
+from interface.steps import PlanStep
+from robots.spec import available_robots, load_robot
 from sim.scene.catalogue import load_catalogue
 from sim.scene.rooms import load_room, room_names
 from sim.session.contingency import load_contingency

@@ -115,6 +115,6 @@ def test_box_follows_the_body() -> None:
 
 
 def _h1():
-    from sim.robots.spec import load_robot
+    from robots.spec import load_robot
 
     return load_robot("h1")

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from data.interface.steps import PlanStep
+from interface.steps import PlanStep
 from sim.session.session import FreePlay, Session
 
 PLAN = ("GoTo(SoapBottle_1)", "Pick(left, SoapBottle_1)", "MoveBack(0.2)", "ToggleOn(right, LightSwitch_1)", "Release(left)")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from data.interface.bodies import Arm
-from data.interface.effects import Condition
-from data.interface.symbolic import SymbolicState
+from interface.bodies import Arm
+from interface.effects import Condition
+from interface.symbolic import SymbolicState
 from sim.expert.expert import Expert
 from sim.session.session import Session
 from sim.tasks.sample import TRAIN_SEEDS, sample_task

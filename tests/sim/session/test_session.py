@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import yaml
 
-import sim.robots
-from data.interface.bodies import Arm
-from data.interface.failures import FailureCode
-from data.interface.steps import Action, PlanStep
+import robots
+from interface.bodies import Arm
+from interface.failures import FailureCode
+from interface.steps import Action, PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 from sim.tasks.predicates import Predicate
@@ -150,7 +150,7 @@ def test_done_ends_the_episode(session):
 
 
 def test_a_robot_described_elsewhere_acts(tmp_path: Path) -> None:
-    source = Path(sim.robots.__file__).parent / "specs" / "x1.yaml"
+    source = Path(robots.__file__).parent / "specs" / "x1.yaml"
     values = yaml.safe_load(source.read_text(encoding="utf-8"))
     values |= {"name": "mine", "mjcf": str((source.parent / values["mjcf"]).resolve())}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")

@@ -2,8 +2,8 @@
 
 import pytest
 
-from data.interface.failures import FailureCategory, FailureCode
-from data.interface.steps import Action
+from interface.failures import FailureCategory, FailureCode
+from interface.steps import Action
 from sim.skills.failures import SkillFailure, failed, succeeded
 
 

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from data.interface.steps import PlanStep
-from sim.robots.spec import load_robot
+from interface.steps import PlanStep
+from robots.spec import load_robot
 from sim.scene.catalogue import load_catalogue
 from sim.scene.compiler import build_type_spec
 from sim.scene.objects import ObjectPlacement, index_object

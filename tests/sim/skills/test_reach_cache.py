@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.robots.build_solver import robot_kit
+from robots.build_solver import robot_kit
 from sim.skills import reach_map
 
 

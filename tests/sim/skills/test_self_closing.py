@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from data.interface.steps import Action, PlanStep
+from interface.steps import Action, PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 from sim.world.metadata import world_metadata

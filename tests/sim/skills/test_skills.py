@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from data.interface.bodies import Arm
-from data.interface.failures import FailureCategory, FailureCode
-from data.interface.steps import Action, PlanStep
+from interface.bodies import Arm
+from interface.failures import FailureCategory, FailureCode
+from interface.steps import Action, PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 from sim.skills.articulate import assess_open_close

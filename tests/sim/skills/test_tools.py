@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from data.interface.feedback import Feedback
-from data.interface.steps import PlanStep
+from interface.feedback import Feedback
+from interface.steps import PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data.interface.bodies import Arm
-from data.interface.failures import FailureCategory
-from data.interface.steps import PlanStep
-from sim.robots.build_solver import robot_kit
-from sim.robots.kinematics import root_quaternion
+from interface.bodies import Arm
+from interface.failures import FailureCategory
+from interface.steps import PlanStep
+from robots.build_solver import robot_kit
+from robots.kinematics import root_quaternion
 from sim.session.session import FreePlay, Session
 from sim.skills.footsteps import footsteps
 from sim.skills.gait import leg_motion

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from data.interface.bodies import PAPER_ROBOTS
-from sim.robots.spec import load_robot
+from interface.bodies import PAPER_ROBOTS
+from robots.spec import load_robot
 from sim.tasks.families import CATEGORIES
 from sim.tasks.sample import BENCHMARK_SEEDS, ROOMS, TRAIN_ROOMS, TRAIN_SEEDS, sample_task, scene_of, start_height_m
 from sim.tasks.task import Task

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from configs.assets import ASSETS_VARIABLE
-from data.interface.actions import ACTIONS
+from interface.actions import ACTIONS
 from sim.tools.catalogue import main
 
 

@@ -13,7 +13,7 @@ from PIL import ImageFont
 from data.generator import generate_clip, write_dataset
 from data.humanml3d import DatasetError
 from data.retarget import Retargeter
-from sim.robots.spec import load_robot
+from robots.spec import load_robot
 from sim.tools.motion import film, find_clip, main, title_lines
 
 

@@ -8,7 +8,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from data.interface.steps import PlanStep
+from interface.steps import PlanStep
 from sim.session.session import FreePlay, Session
 from sim.tools.video import VideoRecorder, main
 

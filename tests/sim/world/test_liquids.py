@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim.robots.spec import load_robot
+from robots.spec import load_robot
 from sim.scene.compiler import PUDDLES
 from sim.scene.objects import ObjectPlacement
 from sim.world.metadata import world_metadata

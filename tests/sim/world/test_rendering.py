@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim.gl import RenderingError, select_backend
-from sim.robots.spec import load_robot
+from robots.gl import RenderingError, select_backend
+from robots.spec import load_robot
 from sim.scene.objects import ObjectPlacement
 from sim.scene.rooms import room_names
 from sim.world.canvas import Canvas

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim.robots.spec import load_robot
+from robots.spec import load_robot
 from sim.scene.objects import ObjectPlacement
 from sim.world.metadata import world_metadata
 from sim.world.world import World, WorldError

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim.robots.spec import load_robot
+from robots.spec import load_robot
 from sim.scene.rooms import room_names
 from sim.world.decor import wall_decor
 from sim.world.rendering import surfaces

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from data.interface.bodies import SIDES
-from sim.robots.spec import load_robot
+from interface.bodies import SIDES
+from robots.spec import load_robot
 from sim.scene.objects import STATE_NAMES, ObjectPlacement
 from sim.scene.rooms import room_names
 from sim.world.metadata import world_metadata

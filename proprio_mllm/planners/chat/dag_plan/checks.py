@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from typing import Final
 
-from data.interface.actions import ACTIONS, ActionKind
-from data.interface.bodies import Arm
-from data.interface.effects import Grasp, HoldOpen, LetGo, PutDown
-from data.interface.steps import Action, ActionError
+from interface.actions import ACTIONS, ActionKind
+from interface.bodies import Arm
+from interface.effects import Grasp, HoldOpen, LetGo, PutDown
+from interface.steps import Action, ActionError
 from proprio_mllm.planners.chat.dag_plan.graph import Graph, Node, NodeKind, NodeReply
 from proprio_mllm.planners.chat.dag_plan.hands import EMPTY, Capacity, Hands
 from proprio_mllm.planners.chat.dag_plan.names import Vocabulary

@@ -15,10 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from data.interface.failures import FailureCode
-from data.interface.feedback import ActionOutcome, Feedback
-from data.interface.observation import Observation
-from data.interface.steps import Action, PlanStep
+from interface.failures import FailureCode
+from interface.feedback import ActionOutcome, Feedback
+from interface.observation import Observation
+from interface.steps import Action, PlanStep
 from proprio_mllm.planners.chat.dag_plan.graph import Graph, Node
 from proprio_mllm.planners.chat.dag_plan.memory import Memory
 from proprio_mllm.planners.chat.dag_plan.names import bindings

@@ -13,9 +13,9 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from data.interface.actions import ActionKind
-from data.interface.bodies import Arm
-from data.interface.steps import Action
+from interface.actions import ActionKind
+from interface.bodies import Arm
+from interface.steps import Action
 
 __all__ = ["Graph", "GraphReply", "Node", "NodeKind", "NodeReply", "RevisedGraph"]
 

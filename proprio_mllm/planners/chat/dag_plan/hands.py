@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from data.interface.bodies import Arm
+from interface.bodies import Arm
 from proprio_mllm.planners.chat.dag_plan.graph import Graph, Node
 
 __all__ = ["ARMS", "BLOCKED", "EMPTY", "Capacity", "Hands", "after", "arms_for", "held_by"]

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections import Counter
 
-from data.interface.belief import Belief
-from data.interface.bodies import Arm
-from data.interface.observation import Observation
+from interface.belief import Belief
+from interface.bodies import Arm
+from interface.observation import Observation
 from proprio_mllm.planners.chat.dag_plan.hands import ARMS, Hands
 
 __all__ = ["Memory"]

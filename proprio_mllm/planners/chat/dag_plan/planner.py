@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
+from interface.feedback import Feedback
+from interface.observation import Observation
 from proprio_mllm.backends.protocol import Backend
 from proprio_mllm.planners.chat.asking import REFLECTION, Answer, Asker
 from proprio_mllm.planners.chat.dag_plan.checks import GraphError, check_graph

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from data.interface.actions import ACTIONS
-from data.interface.feedback import Feedback
-from data.interface.observation import Observation
+from interface.actions import ACTIONS
+from interface.feedback import Feedback
+from interface.observation import Observation
 from proprio_mllm.planners.chat.dag_plan.checks import KINDS
 from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.chat.reflection import Seen, changed_text, completed_steps, failed_text

@@ -22,7 +22,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from data.interface.bodies import Arm
+from interface.bodies import Arm
 from proprio_mllm.planners.chat.dag_plan.graph import Graph, Node
 from proprio_mllm.planners.chat.dag_plan.hands import ARMS, BLOCKED, EMPTY, Capacity, Hands, after, arms_for
 

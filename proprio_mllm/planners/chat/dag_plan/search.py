@@ -11,10 +11,10 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Final
 
-from data.interface.belief import Belief
-from data.interface.bodies import Arm
-from data.interface.effects import Condition
-from data.interface.steps import Action
+from interface.belief import Belief
+from interface.bodies import Arm
+from interface.effects import Condition
+from interface.steps import Action
 from proprio_mllm.planners.furniture import CONTAINERS, SEATS, SURFACES
 from proprio_mllm.planners.scripted.words import candidates, find_mentions, type_of
 

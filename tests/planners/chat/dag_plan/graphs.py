@@ -6,8 +6,8 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from data.interface.actions import ActionKind
-from data.interface.bodies import Arm
+from interface.actions import ActionKind
+from interface.bodies import Arm
 from proprio_mllm.planners.chat.dag_plan.checks import KINDS, check_graph
 from proprio_mllm.planners.chat.dag_plan.graph import Graph, NodeReply
 from proprio_mllm.planners.chat.dag_plan.hands import EMPTY, Hands, after

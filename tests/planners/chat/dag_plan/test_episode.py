@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from configs.schema.robot import RobotConfig
-from data.interface.episode import EpisodeRecord, Outcome
+from interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.evaluation.episode import EpisodeKeyFields, Limits, run_episode
 from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.chat.dag_plan.planner import DagPlanner

@@ -11,9 +11,9 @@ import pytest
 from configs.compose import compose
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.validate import build
-from data.interface.failures import FailureCategory
-from data.interface.feedback import ActionOutcome, Feedback
-from data.interface.observation import HistoryItem, Observation
+from interface.failures import FailureCategory
+from interface.feedback import ActionOutcome, Feedback
+from interface.observation import HistoryItem, Observation
 from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest
 from proprio_mllm.planners.chat.dag_plan.graph import GraphReply, NodeReply, RevisedGraph
 from proprio_mllm.planners.chat.dag_plan.planner import DagPlanner

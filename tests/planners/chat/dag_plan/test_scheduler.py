@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from data.interface.bodies import Arm
+from interface.bodies import Arm
 from proprio_mllm.planners.chat.dag_plan.graph import Graph, NodeReply
 from proprio_mllm.planners.chat.dag_plan.hands import after, arms_for, held_by
 from proprio_mllm.planners.chat.dag_plan.scheduler import Scheduler, Situation

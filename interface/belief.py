@@ -1,0 +1,287 @@
+"""What a planner can believe about the world from its own steps and their feedback codes.
+
+The belief is folded anew from the history at every step, so it is a function of what the observation holds. Nothing is assumed
+about the start: hands are empty, doors and switches unknown. Paper: feedback of the DualTHOR action space; the belief is a
+reference planner's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from interface.actions import ACTIONS, ActionKind, first_refusal
+from interface.bodies import Arm
+from interface.effects import Condition, Grasp, HoldOpen, LetGo, PutDown, Rise, Turn, Walk
+from interface.facts import Call
+from interface.failures import FailureCode
+from interface.observation import HistoryItem
+from interface.steps import Action
+from interface.symbolic import Event, SymbolicState, events_of
+
+__all__ = ["ARM_SPECIFIC", "UNKNOWN", "Belief"]
+
+#: What a hand holds when a code says that it is full and nobody knows of what.
+UNKNOWN: Final = "?"
+#: Codes after which the other arm may do what one could not.
+ARM_SPECIFIC: Final = (FailureCode.OBSTRUCTED, FailureCode.GRASP_MISSED, FailureCode.HANDLE_SLIPPED)
+#: Codes after which what was in the hand no longer is.
+_LOST_HOLD: Final = (FailureCode.SLIPPED, FailureCode.DROPPED, FailureCode.PLACE_MISSED, FailureCode.BROKE)
+#: Codes that say that the action will never work on the object.
+_NEVER: Final = (
+    FailureCode.NOT_PICKUPABLE,
+    FailureCode.TOO_HEAVY,
+    FailureCode.NOT_OPENABLE,
+    FailureCode.NOT_TOGGLEABLE,
+    FailureCode.NOT_RECEPTACLE,
+    FailureCode.NOT_SLICEABLE,
+    FailureCode.NOT_USABLE,
+    FailureCode.NOT_FILLABLE,
+)
+#: Kinds of goals that are met for good, as states.
+_DONE: Final = {
+    "sliced": (Condition.SLICED, True),
+    "clean": (Condition.DIRTY, False),
+    "used_up": (Condition.USED_UP, True),
+    "filled": (Condition.FILLED, True),
+}
+
+
+@dataclass(slots=True)
+class Belief:
+    """The state of body and world, as far as the feedback tells.
+
+    Attributes:
+        state: what the actions that succeeded have made of the world.
+        visited: everything it went to.
+        heavy, light: what needs both hands; what cannot be lifted with both.
+        unsteady: what has to be held under a tool.
+        shut_away: objects in something closed.
+        broken: broken objects.
+        never: (verb, id) that will never work, and why.
+        fails: failures of (verb, id) since the last arm action that succeeded.
+        stances: walks to an object since then.
+        heights: changes of pelvis height at the present stance, metres, upwards positive.
+        at_limit: directions in which the legs are at their end.
+        lowered_m: how much lower the pelvis is than at the start, as far as it was asked to.
+        bearing_deg: bearing that the last GoTo asked for.
+        blocked: walks that were blocked since one succeeded.
+        too_far: what was out of reach from the present stance.
+        let_shut: how often a door that falls shut was let go of, by door.
+        last: events of the newest step.
+    """
+
+    state: SymbolicState = field(default_factory=SymbolicState)
+    visited: set[str] = field(default_factory=set)
+    heavy: set[str] = field(default_factory=set)
+    light: set[str] = field(default_factory=set)
+    unsteady: set[str] = field(default_factory=set)
+    shut_away: set[str] = field(default_factory=set)
+    broken: set[str] = field(default_factory=set)
+    never: dict[tuple[str, str], FailureCode] = field(default_factory=dict)
+    fails: dict[tuple[str, str], list[Event]] = field(default_factory=dict)
+    stances: dict[str, int] = field(default_factory=dict)
+    heights: list[float] = field(default_factory=list)
+    at_limit: set[bool] = field(default_factory=set)
+    lowered_m: float = 0.0
+    bearing_deg: float = 0.0
+    blocked: int = 0
+    too_far: set[str] = field(default_factory=set)
+    let_shut: dict[str, int] = field(default_factory=dict)
+    last: tuple[Event, ...] = ()
+    _opened: tuple[Arm, str] | None = None
+
+    @staticmethod
+    def of(history: Sequence[HistoryItem], self_closing: Sequence[str] = ()) -> Belief:
+        """Folds a history.
+
+        Args:
+            history: earlier steps, oldest first; lines outside the grammar are passed over.
+            self_closing: doors of which the instruction says that they fall shut.
+        """
+        belief = Belief(SymbolicState(self_closing=set(self_closing)))
+        belief.state.conditions[Condition.OPEN] |= dict.fromkeys(self_closing, False)
+        for events in events_of(history):
+            for event in sorted(events, key=lambda event: not event.ok):  # a success forgets failures, but not its own step's
+                belief._take(event)
+            belief.last = events
+        return belief
+
+    def holds_furniture(self) -> Arm | None:
+        """The arm that holds a door open."""
+        return next((arm for arm, item in self.state.held.items() if item in self.state.self_closing), None)
+
+    def done(self, kind: str, object_id: str) -> bool:
+        """Whether an object is known to have been sliced, cleaned, used up or filled; whether food is done nobody tells."""
+        if kind not in _DONE:
+            return False
+        condition, value = _DONE[kind]
+        return self.state.is_in(condition, object_id) is value
+
+    def refusal(self, call: Call) -> FailureCode | None:
+        """The code with which an action is bound to be refused, None where nothing is known against it."""
+        if call.object_id is not None and (call.name, call.object_id) in self.never:
+            return self.never[call.name, call.object_id]
+        arm, door = self._opened or (None, None)  # whether it falls shut is not always told
+        spec = ACTIONS[call.name]
+        if (spec.has_effect(LetGo) and call.arm is arm) or (spec.has_effect(HoldOpen) and call.object_id == door):
+            return None
+        found = first_refusal(call, _Believed(self))
+        return None if found is None else found.code
+
+    def failures(self, verb: str, target: str | None) -> list[Event]:
+        """What went wrong with an action since the last success."""
+        return self.fails.get((verb, target or ""), [])
+
+    def _take(self, event: Event) -> None:
+        action, target = event.action, event.action.object_id or ""
+        if action.spec.has_effect(Walk, Turn):
+            if action.object_id is not None:
+                self.stances[target] = self.stances.get(target, 0) + 1
+                self.bearing_deg = action.bearing_deg or 0.0
+            self.heights.clear()
+            self.too_far.clear()
+            self.blocked += event.code == FailureCode.BLOCKED_PATH
+        elif action.spec.has_effect(Rise) and event.code in ("ok", FailureCode.HEIGHT_LIMIT):  # at the limit a part was done
+            rise_m = sum(effect.sign for effect in action.spec.effects if isinstance(effect, Rise)) * action.given_amount
+            self.heights.append(rise_m)
+            self.lowered_m -= rise_m if event.ok else 0.5 * rise_m
+            self.at_limit = set() if event.ok else {rise_m > 0}
+        if event.ok:
+            self._succeeded(action, target)
+            return
+        self.fails.setdefault((action.name, target), []).append(event)
+        if event.code in (FailureCode.BROKE, FailureCode.OBJECT_BROKEN):
+            held = None if action.arm is None else self.state.held[action.arm]
+            self.broken.add(held or target if action.spec.has_effect(PutDown) else target)
+        self._failed(action, target, event.code)
+
+    def _succeeded(self, action: Action, target: str) -> None:
+        held = None if action.arm is None else self.state.held[action.arm]
+        if action.spec.has_effect(LetGo) and held is not None and held in self.state.self_closing:
+            self.let_shut[held] = self.let_shut.get(held, 0) + 1
+        self.state.succeed(action)
+        if action.spec.has_effect(Walk, Turn) and action.object_id is not None:
+            self.visited.add(target)
+            self.blocked = 0
+        if action.spec.kind is ActionKind.BODY or not action.spec.effects:
+            return
+        self.fails.clear()
+        self.stances.clear()
+        if action.spec.has_effect(Grasp):
+            self.shut_away.discard(target)
+        if action.spec.has_effect(HoldOpen) and action.arm is not None:
+            self._opened = (action.arm, target)
+
+    def _failed(self, action: Action, target: str, code: str) -> None:
+        arm, state = action.arm, self.state
+        if code in (FailureCode.ALREADY_IN_STATE, FailureCode.NOT_DIRTY):
+            state.settle(action)
+        elif code == FailureCode.TOO_FAR:
+            self.too_far.add(target)
+        elif code in _LOST_HOLD and action.spec.has_effect(Grasp, PutDown):
+            state.lifted = None if arm is None else state.lifted
+            if arm is not None:
+                state.held[arm] = None
+        elif code == FailureCode.HAND_EMPTY and arm is not None:
+            state.let_go(arm)
+        elif code == FailureCode.HAND_OCCUPIED and arm is not None and state.held[arm] is None:
+            state.held[arm] = self._opened[1] if self._opened is not None and self._opened[0] is arm else UNKNOWN
+        elif code == FailureCode.IN_USE and action.spec.has_effect(Walk, Turn) and self._opened is not None:
+            state.self_closing = {*state.self_closing, self._opened[1]}  # the door is still in the hand
+            state.held[self._opened[0]] = self._opened[1]
+        elif code == FailureCode.ALREADY_HELD and arm is not None and state.arm_with(target) is None:
+            state.held[arm.other] = target
+        elif code == FailureCode.RECEPTACLE_CLOSED:
+            if action.spec.has_effect(PutDown):
+                state.conditions[Condition.OPEN][target] = False
+            else:
+                self.shut_away.add(target)
+                if self._opened is not None:  # it has fallen shut, or was brushed
+                    state.conditions[Condition.OPEN][self._opened[1]] = False
+        elif code == FailureCode.NEEDS_TWO_HANDS:
+            self.heavy.add(target)
+        elif code == FailureCode.NOT_LIFTABLE:
+            self.light.add(target)
+        elif code == FailureCode.NEEDS_STEADYING:
+            self.unsteady.add(target)
+        elif code == FailureCode.SOURCE_OFF:
+            state.conditions[Condition.ON].clear()
+        elif code in _NEVER:
+            self.never[action.name, target] = FailureCode(code)
+
+
+@dataclass(frozen=True, slots=True)
+class _Thing:
+    """An object with which everything can be done that nothing is known against."""
+
+    object_id: str
+    holders: tuple[str, ...]
+    movable: bool
+    two_handed: bool
+    liftable: bool
+    opened: bool
+    closed: bool
+    on: bool | None
+    sliced: bool
+    soiled: bool
+    used_up: bool
+    broken: bool
+    filled: bool
+    shut: bool
+    full: bool = False
+    covered: bool = False
+    unsteady: bool = False
+    pickupable: bool = True
+    receptacle: bool = True
+    openable: bool = True
+    toggleable: bool = True
+    sliceable: bool = True
+    consumable: bool = True
+    fillable: bool = True
+    cutter: bool = True
+    wiper: bool = True
+
+
+class _Believed:
+    """A belief as the facts that requirements look at."""
+
+    def __init__(self, belief: Belief) -> None:
+        self._belief, self._state = belief, belief.state
+
+    def held(self, arm: Arm) -> str | None:
+        return self._state.held[arm]
+
+    @property
+    def lifted(self) -> str | None:
+        return self._state.lifted
+
+    def object(self, object_id: str) -> _Thing:
+        state, name = self._state, object_id
+        return _Thing(
+            object_id=name,
+            holders=state.holders(name),
+            movable=name not in state.self_closing,
+            two_handed=name in self._belief.heavy,
+            liftable=name not in self._belief.light,
+            opened=state.is_in(Condition.OPEN, name) is True,
+            closed=state.is_in(Condition.OPEN, name) is False,
+            shut=state.is_in(Condition.OPEN, name) is False,
+            on=state.is_in(Condition.ON, name),
+            sliced=state.is_in(Condition.SLICED, name) is True,
+            soiled=state.is_in(Condition.DIRTY, name) is not False,
+            used_up=state.is_in(Condition.USED_UP, name) is True,
+            filled=state.is_in(Condition.FILLED, name) is not False,
+            broken=name in self._belief.broken,
+        )
+
+    def carriers(self, object_id: str) -> Iterable[str]:
+        place = self._state.at.get(object_id)
+        return () if place is None else (place,)
+
+    def overload_kg(self, object_id: str, arms: int) -> float:
+        return -1.0
+
+    def outlet(self, object_id: str) -> str | None:
+        return object_id

@@ -1,0 +1,69 @@
+"""What a belief rules out: what is bound to be refused, and nothing that could succeed."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from interface.belief import Belief
+from interface.observation import HistoryItem
+from interface.steps import Action
+from proprio_mllm.evaluation.lessons import WordsOnly
+from proprio_mllm.planners.scripted.planner import ScriptedPlanner
+
+
+def believed(*log: str) -> Belief:
+    return Belief.of([HistoryItem(line.rpartition(" ")[0], line) for line in log])
+
+
+@pytest.mark.parametrize(
+    ("log", "call", "code"),
+    [
+        ((), "Place(left, Shelf_1)", "HandEmpty"),
+        ((), "Pick(left, Mug_1)", None),
+        (("Pick(left, Mug_1) ok",), "Pick(left, Bowl_1)", "HandOccupied"),
+        (("Pick(left, Mug_1) ok",), "Pick(right, Mug_1)", "AlreadyHeld"),
+        (("Pick(left, Mug_1) ok",), "Place(left, Mug_1)", "NotReceptacle"),
+        (("Pick(left, Mug_1) ok",), "Lift(Box_1)", "HandOccupied"),
+        (("Pick(left, Mug_1) ok", "Place(left, Shelf_1) ok"), "Pick(left, Mug_1)", None),
+        (("Pick(left, Mug_1) Slipped",), "Pick(left, Mug_1)", None),
+        (("Pick(left, Box_1) NeedsTwoHands",), "Pick(right, Box_1)", "NeedsTwoHands"),
+        (("Lift(Box_1) ok",), "Pick(left, Mug_1)", "BothHandsBusy"),
+        (("Pick(left, Rug_1) NotPickupable",), "Pick(left, Rug_1)", "NotPickupable"),
+        (("Place(left, Fridge_1) ReceptacleClosed", "Pick(left, Mug_1) ok"), "Place(left, Fridge_1)", "ReceptacleClosed"),
+        (("ToggleOn(left, Lamp_1) ok",), "ToggleOn(right, Lamp_1)", "AlreadyInState"),
+        (("ToggleOn(left, Lamp_1) ok",), "ToggleOff(right, Lamp_1)", None),
+        (("Open(left, Drawer_1) ok", "Open(left, Drawer_2) ok"), "Open(left, Drawer_1)", "AlreadyInState"),
+        (("Open(left, Drawer_1) ok",), "Open(right, Drawer_1)", None),  # it may have fallen shut
+        (("Open(left, Drawer_1) ok",), "Release(left)", None),  # it may have to be held
+        (("Open(left, Drawer_1) ok",), "Release(right)", "HandEmpty"),
+        ((), "Fill(left, Sink_1)", "HandEmpty"),
+        (("Pick(left, Cup_1) ok",), "Fill(left, Sink_1)", None),  # whether water runs nobody has told
+        (("Pick(left, Cup_1) ok", "ToggleOff(right, Sink_1) ok"), "Fill(left, Sink_1)", "SourceOff"),
+    ],
+)
+def test_what_is_bound_to_be_refused(log: tuple[str, ...], call: str, code: str | None) -> None:
+    assert believed(*log).refusal(Action.parse(call)) == code
+
+
+def test_what_is_held_against_an_action_is_so() -> None:
+    """In the text world, mistakes among the steps: no refused action succeeds, and most refusals name the code."""
+    seen: Counter[str] = Counter()
+    for seed in range(60):
+        episode, teacher = WordsOnly(-1 - seed), ScriptedPlanner()
+        while episode.steps < 30 and not episode.world.done():
+            step, job = teacher.decide(episode.shown())
+            if job is None:
+                break
+            step = episode.world.mistake(step) if episode.rng.random() < 0.4 else step
+            expected = [Belief.of(episode.shown().history).refusal(one) for one in step.actions]
+            episode.take(step)
+            codes = [text.rpartition(" ")[2] for text in episode.shown().history[-1].feedback.split(";")]
+            seen.update(
+                "as said" if code == one else "succeeded" if code == "ok" else "other"
+                for one, code in zip(expected, codes, strict=True)
+                if one is not None
+            )
+    assert seen["succeeded"] == 0
+    assert seen["as said"] > 3 * seen["other"] + 20

@@ -1,0 +1,216 @@
+"""The table of actions: which code comes first, what holds afterwards, and who may work beside whom."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import pytest
+
+from interface.actions import ACTIONS, ActionKind, bringing_about, exclude_each_other, first_refusal
+from interface.bodies import Arm
+from interface.effects import Condition
+from interface.failures import FAILURES, FailureCode
+from interface.observation import HistoryItem
+from interface.steps import Action
+from interface.symbolic import SymbolicState, events_of
+
+
+@dataclass
+class Item:
+    """An object with every fact spelled out."""
+
+    object_id: str
+    movable: bool = True
+    pickupable: bool = True
+    two_handed: bool = False
+    liftable: bool = False
+    receptacle: bool = False
+    openable: bool = False
+    toggleable: bool = False
+    sliceable: bool = False
+    consumable: bool = False
+    fillable: bool = False
+    cutter: bool = False
+    wiper: bool = False
+    unsteady: bool = False
+    holders: tuple[str, ...] = ()
+    opened: bool = False
+    closed: bool = False
+    shut: bool = False
+    covered: bool = False
+    on: bool = False
+    sliced: bool = False
+    soiled: bool = False
+    used_up: bool = False
+    broken: bool = False
+    filled: bool = False
+    full: bool = False
+
+
+@dataclass
+class Small:
+    """A world of a few objects."""
+
+    items: dict[str, Item]
+    hands: dict[Arm, str] = field(default_factory=dict)
+    lifted: str | None = None
+    inside: dict[str, str] = field(default_factory=dict)
+    overload: float = -1.0
+
+    def held(self, arm: Arm) -> str | None:
+        return self.hands.get(arm)
+
+    def object(self, object_id: str) -> Item:
+        return self.items[object_id]
+
+    def carriers(self, object_id: str) -> Iterable[str]:
+        return [self.inside[object_id]] if object_id in self.inside else []
+
+    def overload_kg(self, object_id: str, arms: int) -> float:
+        return self.overload
+
+    def outlet(self, object_id: str) -> str | None:
+        return "Faucet_1" if object_id in ("Faucet_1", "Sink_1") else None
+
+
+def world(**changes: object) -> Small:
+    items = {
+        "Mug_1": Item("Mug_1", fillable=True),
+        "Jug_1": Item("Jug_1", fillable=True, filled=True),
+        "Bread_1": Item("Bread_1", sliceable=True, unsteady=True),
+        "Knife_1": Item("Knife_1", cutter=True),
+        "Fridge_1": Item("Fridge_1", movable=False, pickupable=False, receptacle=True, openable=True, shut=True, closed=True),
+        "Table_1": Item("Table_1", movable=False, pickupable=False, receptacle=True),
+        "Box_1": Item("Box_1", pickupable=False, two_handed=True, liftable=True),
+        "Faucet_1": Item("Faucet_1", movable=False, pickupable=False, toggleable=True),
+        "Sink_1": Item("Sink_1", movable=False, pickupable=False, receptacle=True),
+    }
+    return Small(items, **changes)  # type: ignore[arg-type]
+
+
+def code(text: str, facts: Small) -> str:
+    refusal = first_refusal(Action.parse(text), facts)
+    return "" if refusal is None else refusal.code
+
+
+LEFT_MUG = {Arm.LEFT: "Mug_1"}
+
+
+@pytest.mark.parametrize(
+    ("text", "facts", "expected"),
+    [
+        ("Pick(left, Mug_1)", world(), ""),
+        ("Pick(left, Jug_1)", world(hands=LEFT_MUG), "HandOccupied"),
+        ("Pick(left, Mug_1)", world(lifted="Box_1", hands=LEFT_MUG), "BothHandsBusy"),  # before the hand itself
+        ("Pick(left, Table_1)", world(), "NotPickupable"),
+        ("Pick(left, Box_1)", world(), "NeedsTwoHands"),
+        ("Pick(left, Box_1)", world(overload=2.0), "TooHeavy"),  # before the number of hands
+        ("Pick(left, Mug_1)", world(inside={"Mug_1": "Fridge_1"}), "ReceptacleClosed"),
+        ("Place(left, Table_1)", world(), "HandEmpty"),
+        ("Place(left, Fridge_1)", world(hands=LEFT_MUG), "ReceptacleClosed"),
+        ("Place(left, Mug_1)", world(hands=LEFT_MUG), "NotReceptacle"),
+        ("Place(left, Table_1)", world(hands=LEFT_MUG), ""),
+        ("Open(right, Table_1)", world(), "NotOpenable"),
+        ("Close(right, Fridge_1)", world(), "AlreadyInState"),
+        ("Open(right, Fridge_1)", world(), ""),
+        ("ToggleOff(right, Faucet_1)", world(), "AlreadyInState"),
+        ("ToggleOn(right, Mug_1)", world(), "NotToggleable"),
+        ("Slice(left, Bread_1)", world(hands=LEFT_MUG), "NeedsTool"),
+        ("Slice(left, Mug_1)", world(hands={Arm.LEFT: "Knife_1"}), "NotSliceable"),
+        ("Slice(left, Bread_1)", world(hands={Arm.LEFT: "Knife_1"}), "NeedsSteadying"),
+        ("Fill(left, Sink_1)", world(hands=LEFT_MUG), "SourceOff"),
+        ("Fill(left, Table_1)", world(hands=LEFT_MUG), "NotFillable"),
+        ("Pour(left, Jug_1)", world(hands=LEFT_MUG), "Empty"),
+        ("Pour(left, Mug_1)", world(hands={Arm.LEFT: "Jug_1"}), ""),
+        ("Lift(Mug_1)", world(), "NotLiftable"),
+        ("Lift(Box_1)", world(hands=LEFT_MUG), "HandOccupied"),
+        ("PlaceBoth(Table_1)", world(), "HandEmpty"),
+        ("Release(left)", world(), "HandEmpty"),
+        ("GoTo(Table_1)", world(hands={Arm.LEFT: "Fridge_1"}), "InUse"),  # a hand at a door keeps the robot there
+        ("GoTo(Table_1)", world(hands=LEFT_MUG), ""),
+        ("ResetArm(left)", world(hands={Arm.LEFT: "Fridge_1"}), "InUse"),
+    ],
+)
+def test_the_first_requirement_that_fails_decides(text: str, facts: Small, expected: str) -> None:
+    assert code(text, facts) == expected
+    assert not expected or FailureCode(expected) in Action.parse(text).spec.codes
+
+
+def test_what_is_steadied_can_be_cut_where_it_rests() -> None:
+    facts = world(hands={Arm.LEFT: "Knife_1", Arm.RIGHT: "Bread_1"}, inside={"Bread_1": "Table_1"})
+    facts.items["Bread_1"].holders = ("right",)
+    assert code("Slice(left, Bread_1)", facts) == ""
+    facts.inside.clear()  # in the air
+    assert code("Slice(left, Bread_1)", facts) == "NeedsSteadying"
+
+
+def test_margins_come_with_weight() -> None:
+    refusal = first_refusal(Action.parse("Pick(left, Box_1)"), world(overload=1.5))
+    assert refusal is not None and dict(refusal.margins) == {"mass_kg": 1.5}
+
+
+def after(*lines: str, shutting: tuple[str, ...] = ()) -> SymbolicState:
+    state = SymbolicState(self_closing=shutting)
+    for events in events_of([HistoryItem("", line) for line in lines]):
+        for event in events:
+            if event.ok:
+                state.succeed(event.action)
+    return state
+
+
+def test_effects_follow_a_log() -> None:
+    state = after("Pick(left, Mug_1) ok; Open(right, Fridge_1) TooFar", "Place(left, Table_1) ok", "Lift(Box_1) ok")
+    assert state.at == {"Mug_1": "Table_1"}
+    assert state.lifted == "Box_1" and state.free_arms() == ()
+    assert state.is_in(Condition.OPEN, "Fridge_1") is None
+    state.succeed(Action.parse("PlaceBoth(Table_1)"))
+    assert state.at["Box_1"] == "Table_1" and len(state.free_arms()) == 2
+
+
+def test_a_door_that_falls_shut_stays_in_the_hand_and_may_be_shut_when_it_is_let_go() -> None:
+    state = after("Open(left, Drawer_1) ok", shutting=("Drawer_1",))
+    assert state.held[Arm.LEFT] == "Drawer_1" and state.is_in(Condition.OPEN, "Drawer_1")
+    state.succeed(Action.parse("Release(left)"))
+    assert state.held[Arm.LEFT] is None and state.is_in(Condition.OPEN, "Drawer_1") is None
+    assert after("Open(left, Fridge_1) ok").held[Arm.LEFT] is None
+
+
+def test_steadying_leaves_an_object_where_it_is() -> None:
+    state = after("Pick(right, Bread_1) ok", "Place(right, Table_1) ok", "Hold(right, Bread_1) ok")
+    assert state.at == {"Bread_1": "Table_1"} and state.in_place == {"Bread_1"}
+    state.succeed(Action.parse("Pick(right, Bread_1)"))
+    assert state.at == {} and state.in_place == set()
+
+
+def test_body_and_liquids() -> None:
+    state = after("GoTo(Table_1) ok", "MoveUp ok", "MoveUp(0.2) ok", "MoveDown() ok", "RotateLeft(30) ok")
+    assert state.here == "Table_1" and state.rise_m == pytest.approx(0.1)
+    state.succeed(Action.parse("MoveBack(0.3)"))
+    assert state.here is None
+    state = after("Pick(left, Mug_1) ok", "Fill(left, Sink_1) ok", "Pour(left, Vase_1) ok")
+    assert state.is_in(Condition.FILLED, "Vase_1") and state.is_in(Condition.FILLED, "Mug_1") is None
+
+
+def test_who_may_share_an_object() -> None:
+    def both(first: str, second: str) -> bool:
+        return exclude_each_other(Action.parse(first), Action.parse(second))
+
+    assert not both("Place(left, Table_1)", "Place(right, Table_1)")
+    assert not both("Hold(left, Bread_1)", "Slice(right, Bread_1)")
+    assert both("Pick(left, Mug_1)", "Pick(right, Mug_1)")
+    assert both("Open(left, Fridge_1)", "Place(right, Fridge_1)")
+    assert not both("Release(left)", "Release(right)")
+    for first in ACTIONS.values():
+        for name in first.beside:
+            assert first.name in ACTIONS[name].beside, (first.name, name)
+
+
+def test_every_row_is_whole() -> None:
+    assert [spec.name for spec in bringing_about(Condition.SLICED, True)] == ["Slice"]
+    met = {code for spec in ACTIONS.values() for code in spec.codes}
+    assert met == set(FAILURES)
+    for spec in ACTIONS.values():
+        assert spec.meaning
+        assert spec.arms == {ActionKind.ARM: 1, ActionKind.TWO_ARM: 2}.get(spec.kind, 0)
+        assert spec.kind is ActionKind.EPISODE or spec.requires
