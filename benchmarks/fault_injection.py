@@ -36,7 +36,7 @@ from sim.expert.expert import Expert
 from sim.session.session import Session
 from sim.tasks.predicates import Predicate
 from sim.tasks.task import Task
-from sim.world.metadata import world_metadata
+from sim.world.facts import world_facts
 
 __all__ = ["CAUSES", "LATE_SLIPS", "SLIPS", "Cause", "FaultyPlanner"]
 
@@ -515,8 +515,8 @@ class FaultyPlanner:
     def _satisfied(self) -> bool:
         """Whether all holds that the planner believes in: it is done, and not stuck for a reason of its own."""
         assert self._session is not None and self._believed is not None
-        metadata = world_metadata(self._session.world)
-        return all(goal.holds(metadata) for goal in self._believed)
+        objects = world_facts(self._session.world).objects
+        return all(goal.holds(objects) for goal in self._believed)
 
     def _is_away(self, action: Action) -> bool:
         """Whether what an arm is about to reach for is out of every arm's reach; walks are no attempt."""

@@ -28,11 +28,11 @@ import numpy as np
 import sim.tasks
 from interface.steps import PlanStep
 from robots.spec import load_robot
+from sim.interfaces.metadata import world_metadata
 from sim.scene.compiler import build_spec
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 from sim.tasks.task import load_benchmark
-from sim.world.metadata import world_metadata
 from sim.world.scene_state import scene_key
 from sim.world.world import World
 

@@ -137,7 +137,7 @@ def _door(name: str, meaning: str, opening: bool) -> ActionSpec:
         takes_object=True,
         requires=(
             *needs.FREE_HAND,
-            *need(_C.NOT_OPENABLE, lambda s: s.target.openable),
+            *need(_C.NOT_OPENABLE, lambda s: s.target.can.openable),
             *need(_C.IN_USE, lambda s: not s.target.holders),
             *need(_C.ALREADY_IN_STATE, lambda s: not (s.target.opened if opening else s.target.closed)),
         ),
@@ -154,7 +154,7 @@ def _switch(name: str, meaning: str, on: bool) -> ActionSpec:
         takes_object=True,
         requires=(
             *needs.FREE_HAND,
-            *need(_C.NOT_TOGGLEABLE, lambda s: s.target.toggleable),
+            *need(_C.NOT_TOGGLEABLE, lambda s: s.target.can.toggleable),
             *need(_C.ALREADY_IN_STATE, lambda s: s.target.on != on),
             *needs.NOT_BROKEN,
             *need(_C.OBSTRUCTED, lambda s: not s.target.covered),
@@ -214,8 +214,8 @@ _TABLE: Final = (
         beside=("Slice", "Clean", "Pour"),
         requires=(
             *needs.FREE_HAND,
-            *where(lambda s: s.target.movable, needs.ONE_HAND_LOAD),
-            *need(_C.NOT_PICKUPABLE, lambda s: s.target.movable or s.target.openable),
+            *where(lambda s: s.target.can.movable, needs.ONE_HAND_LOAD),
+            *need(_C.NOT_PICKUPABLE, lambda s: s.target.can.movable or s.target.can.openable),
             *need(_C.ALREADY_HELD, lambda s: not s.target.holders),
         ),
         effects=(Grasp(in_place=True),),
@@ -237,8 +237,8 @@ _TABLE: Final = (
         beside=("Hold",),
         requires=(
             *needs.HAND_HOLDS,
-            *need(_C.NEEDS_TOOL, lambda s: s.tool.cutter),
-            *need(_C.NOT_SLICEABLE, lambda s: s.target.sliceable),
+            *need(_C.NEEDS_TOOL, lambda s: s.tool.can.cutter),
+            *need(_C.NOT_SLICEABLE, lambda s: s.target.can.sliceable),
             *need(_C.ALREADY_IN_STATE, lambda s: not s.target.sliced),
             *need(_C.IN_USE, lambda s: s.arm.value not in s.target.holders),
             *needs.ACCESSIBLE,
@@ -256,7 +256,7 @@ _TABLE: Final = (
         beside=("Hold",),
         requires=(
             *needs.HAND_HOLDS,
-            *need(_C.NEEDS_TOOL, lambda s: s.tool.wiper),
+            *need(_C.NEEDS_TOOL, lambda s: s.tool.can.wiper),
             *need(_C.NOT_DIRTY, lambda s: s.target.soiled),
             *need(_C.IN_USE, lambda s: s.target.object_id != s.tool.object_id),
             *needs.ACCESSIBLE,
@@ -272,7 +272,7 @@ _TABLE: Final = (
         takes_object=True,
         requires=(
             *needs.FREE_HAND,
-            *need(_C.NOT_USABLE, lambda s: s.target.consumable),
+            *need(_C.NOT_USABLE, lambda s: s.target.can.consumable),
             *need(_C.ALREADY_IN_STATE, lambda s: not s.target.used_up),
             *needs.ACCESSIBLE,
         ),
@@ -288,8 +288,8 @@ _TABLE: Final = (
         beside=("Hold",),
         requires=(
             *needs.VESSEL,
-            *need(_C.EMPTY, lambda s: s.tool.filled),
-            *need(_C.NOT_FILLABLE, lambda s: s.target.fillable and s.target.object_id != s.tool.object_id),
+            *need(_C.EMPTY, lambda s: s.tool.fill > 0.0),
+            *need(_C.NOT_FILLABLE, lambda s: s.target.can.fillable and s.target.object_id != s.tool.object_id),
             *needs.NOT_BROKEN,
             *need(_C.IN_USE, lambda s: s.arm.other.value not in s.target.holders),
             *need(_C.ALREADY_IN_STATE, lambda s: not s.target.full),
@@ -308,8 +308,8 @@ _TABLE: Final = (
             *needs.VESSEL,
             *need(_C.OBJECT_BROKEN, lambda s: not s.tool.broken),
             *need(_C.ALREADY_IN_STATE, lambda s: not s.tool.full),
-            *need(_C.NOT_FILLABLE, lambda s: s.facts.outlet(s.target.object_id) is not None),
-            *need(_C.SOURCE_OFF, lambda s: s.facts.object(s.facts.outlet(s.target.object_id) or "").on is not False),
+            *need(_C.NOT_FILLABLE, lambda s: s.target.outlet is not None),
+            *need(_C.SOURCE_OFF, lambda s: s.facts.objects[s.target.outlet or ""].on is not False),
         ),
         effects=(Become(Condition.FILLED, True, "tool"),),
         meets=(*_REACH, _C.POUR_MISSED, _C.SPILLED, *_NOTHING),
@@ -320,7 +320,7 @@ _TABLE: Final = (
         "bring the arm back to rest",
         requires=(
             *need(_C.BOTH_HANDS_BUSY, lambda s: s.facts.lifted is None),
-            *need(_C.IN_USE, lambda s: (name := s.facts.held(s.arm)) is None or s.facts.object(name).movable),
+            *need(_C.IN_USE, lambda s: (name := s.facts.held[s.arm]) is None or s.facts.objects[name].can.movable),
         ),
         meets=(_C.OBSTRUCTED,),
     ),

@@ -7,14 +7,14 @@ reference planner's.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from interface.actions import ACTIONS, ActionKind, first_refusal
 from interface.bodies import Arm
 from interface.effects import Condition, Grasp, HoldOpen, LetGo, PutDown, Rise, Turn, Walk
-from interface.facts import Call
+from interface.facts import Affordances, Call, Facts, ObjectFacts, Objects
 from interface.failures import FailureCode
 from interface.observation import HistoryItem
 from interface.steps import Action
@@ -45,6 +45,12 @@ _DONE: Final = {
     "clean": (Condition.DIRTY, False),
     "used_up": (Condition.USED_UP, True),
     "filled": (Condition.FILLED, True),
+}
+#: What can be done with what is movable or not, and liftable or not, as far as one can know.
+_CAN: Final = {
+    (movable, liftable): Affordances(movable=movable, liftable=liftable)
+    for movable in (False, True)
+    for liftable in (False, True)
 }
 
 
@@ -127,8 +133,31 @@ class Belief:
         spec = ACTIONS[call.name]
         if (spec.has_effect(LetGo) and call.arm is arm) or (spec.has_effect(HoldOpen) and call.object_id == door):
             return None
-        found = first_refusal(call, _Believed(self))
+        found = first_refusal(call, self.facts())
         return None if found is None else found.code
+
+    def facts(self) -> Facts:
+        """What is known as facts; of anything one can do what nothing is known against."""
+        return Facts(Objects((), self._facts_of), self.state.held, self.state.lifted)
+
+    def _facts_of(self, name: str) -> ObjectFacts:
+        state = self.state
+        opened, filled, place = state.is_in(Condition.OPEN, name), state.is_in(Condition.FILLED, name), state.at.get(name)
+        return ObjectFacts(
+            object_id=name,
+            can=_CAN[name not in state.self_closing, name not in self.light],
+            holders=state.holders(name),
+            carriers=() if place is None else (place,),
+            two_handed=name in self.heavy,
+            openness=0.5 if opened is None else float(opened),
+            on=state.is_in(Condition.ON, name),
+            fill=0.0 if filled is False else 0.5,
+            dirty=state.is_in(Condition.DIRTY, name) is not False,
+            sliced=state.is_in(Condition.SLICED, name) is True,
+            used_up=state.is_in(Condition.USED_UP, name) is True,
+            broken=name in self.broken,
+            outlet=name,
+        )
 
     def failures(self, verb: str, target: str | None) -> list[Event]:
         """What went wrong with an action since the last success."""
@@ -210,78 +239,3 @@ class Belief:
             state.conditions[Condition.ON].clear()
         elif code in _NEVER:
             self.never[action.name, target] = FailureCode(code)
-
-
-@dataclass(frozen=True, slots=True)
-class _Thing:
-    """An object with which everything can be done that nothing is known against."""
-
-    object_id: str
-    holders: tuple[str, ...]
-    movable: bool
-    two_handed: bool
-    liftable: bool
-    opened: bool
-    closed: bool
-    on: bool | None
-    sliced: bool
-    soiled: bool
-    used_up: bool
-    broken: bool
-    filled: bool
-    shut: bool
-    full: bool = False
-    covered: bool = False
-    unsteady: bool = False
-    pickupable: bool = True
-    receptacle: bool = True
-    openable: bool = True
-    toggleable: bool = True
-    sliceable: bool = True
-    consumable: bool = True
-    fillable: bool = True
-    cutter: bool = True
-    wiper: bool = True
-
-
-class _Believed:
-    """A belief as the facts that requirements look at."""
-
-    def __init__(self, belief: Belief) -> None:
-        self._belief, self._state = belief, belief.state
-
-    def held(self, arm: Arm) -> str | None:
-        return self._state.held[arm]
-
-    @property
-    def lifted(self) -> str | None:
-        return self._state.lifted
-
-    def object(self, object_id: str) -> _Thing:
-        state, name = self._state, object_id
-        return _Thing(
-            object_id=name,
-            holders=state.holders(name),
-            movable=name not in state.self_closing,
-            two_handed=name in self._belief.heavy,
-            liftable=name not in self._belief.light,
-            opened=state.is_in(Condition.OPEN, name) is True,
-            closed=state.is_in(Condition.OPEN, name) is False,
-            shut=state.is_in(Condition.OPEN, name) is False,
-            on=state.is_in(Condition.ON, name),
-            sliced=state.is_in(Condition.SLICED, name) is True,
-            soiled=state.is_in(Condition.DIRTY, name) is not False,
-            used_up=state.is_in(Condition.USED_UP, name) is True,
-            filled=state.is_in(Condition.FILLED, name) is not False,
-            broken=name in self._belief.broken,
-        )
-
-    def carriers(self, object_id: str) -> Iterable[str]:
-        place = self._state.at.get(object_id)
-        return () if place is None else (place,)
-
-    def overload_kg(self, object_id: str, arms: int) -> float:
-        return -1.0
-
-    def outlet(self, object_id: str) -> str | None:
-        return object_id

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from interface.bodies import Arm
 from interface.facts import Situation
 from interface.failures import FailureCode
 
@@ -72,34 +71,34 @@ def _in_other_hand(s: Situation) -> bool:
 
 #: The acting hand is empty.
 FREE_HAND: Final = need(FailureCode.BOTH_HANDS_BUSY, lambda s: s.facts.lifted is None) + need(
-    FailureCode.HAND_OCCUPIED, lambda s: s.facts.held(s.arm) is None
+    FailureCode.HAND_OCCUPIED, lambda s: s.facts.held[s.arm] is None
 )
 #: Both hands are empty.
 BOTH_FREE: Final = need(FailureCode.BOTH_HANDS_BUSY, lambda s: s.facts.lifted is None) + need(
-    FailureCode.HAND_OCCUPIED, lambda s: all(s.facts.held(arm) is None for arm in Arm)
+    FailureCode.HAND_OCCUPIED, lambda s: all(item is None for item in s.facts.held.values())
 )
 #: The acting hand holds something, by itself.
 HAND_HOLDS: Final = need(FailureCode.BOTH_HANDS_BUSY, lambda s: s.facts.lifted is None) + need(
-    FailureCode.HAND_EMPTY, lambda s: s.facts.held(s.arm) is not None
+    FailureCode.HAND_EMPTY, lambda s: s.facts.held[s.arm] is not None
 )
 #: Both hands hold one object.
 BOTH_HOLD: Final = need(FailureCode.HAND_EMPTY, lambda s: s.facts.lifted is not None)
 #: The acting hand holds something, by itself or with the other one.
-ANY_HOLD: Final = need(FailureCode.HAND_EMPTY, lambda s: s.facts.lifted is not None or s.facts.held(s.arm) is not None)
+ANY_HOLD: Final = need(FailureCode.HAND_EMPTY, lambda s: s.facts.lifted is not None or s.facts.held[s.arm] is not None)
 #: No hand is at a door or drawer, which a body on the move would tear at.
 BASE_FREE: Final = need(
     FailureCode.IN_USE,
-    lambda s: all(name is None or s.facts.object(name).movable for name in map(s.facts.held, Arm)),
+    lambda s: all(name is None or s.facts.objects[name].can.movable for name in s.facts.held.values()),
 )
 #: The target is not shut away.
 ACCESSIBLE: Final = need(
     FailureCode.RECEPTACLE_CLOSED,
-    lambda s: not any(s.facts.object(name).shut for name in s.facts.carriers(s.target.object_id)),
+    lambda s: s.facts.shut_around(s.target.object_id) is None,
 )
 #: The target can take what is held; a hand at a door holds it open and does not occupy it.
 FREE_RECEPTACLE: Final = (
-    *need(FailureCode.NOT_RECEPTACLE, lambda s: s.target.receptacle and s.target.object_id != s.tool.object_id),
-    *need(FailureCode.IN_USE, lambda s: not (s.target.holders and s.target.movable)),
+    *need(FailureCode.NOT_RECEPTACLE, lambda s: s.target.can.receptacle and s.target.object_id != s.tool.object_id),
+    *need(FailureCode.IN_USE, lambda s: not (s.target.holders and s.target.can.movable)),
     *need(FailureCode.RECEPTACLE_CLOSED, lambda s: not s.target.shut),
     *ACCESSIBLE,
 )
@@ -108,14 +107,14 @@ NOT_BROKEN: Final = need(FailureCode.OBJECT_BROKEN, lambda s: not s.target.broke
 #: What would roll or slide away under a tool is held by the other hand where it rests.
 STEADY: Final = need(
     FailureCode.NEEDS_STEADYING,
-    lambda s: not s.target.unsteady or (_in_other_hand(s) and any(True for _ in s.facts.carriers(s.target.object_id))),
+    lambda s: not s.target.can.unsteady or (_in_other_hand(s) and bool(s.target.carriers)),
 )
 #: The hand holds a vessel.
-VESSEL: Final = HAND_HOLDS + need(FailureCode.NEEDS_TOOL, lambda s: s.tool.movable and s.tool.fillable)
+VESSEL: Final = HAND_HOLDS + need(FailureCode.NEEDS_TOOL, lambda s: s.tool.can.movable and s.tool.can.fillable)
 #: One hand can carry the target.
 ONE_HAND_LOAD: Final = (
     *need(FailureCode.ALREADY_HELD, lambda s: not s.target.holders),
-    *need(FailureCode.NOT_PICKUPABLE, lambda s: s.target.movable),
+    *need(FailureCode.NOT_PICKUPABLE, lambda s: s.target.can.movable),
     Requirement(
         FailureCode.TOO_HEAVY,
         lambda s: not s.target.two_handed or s.facts.overload_kg(s.target.object_id, 2) <= 0.0,
@@ -126,18 +125,18 @@ ONE_HAND_LOAD: Final = (
         lambda s: not s.target.two_handed,
         ("mass_kg", lambda s: s.facts.overload_kg(s.target.object_id, 1)),
     ),
-    *need(FailureCode.NOT_PICKUPABLE, lambda s: s.target.pickupable),
+    *need(FailureCode.NOT_PICKUPABLE, lambda s: s.target.can.pickupable),
     *NOT_BROKEN,
     *ACCESSIBLE,
 )
 #: Two hands can carry the target.
 TWO_HAND_LOAD: Final = (
-    *need(FailureCode.NOT_LIFTABLE, lambda s: s.target.movable),
+    *need(FailureCode.NOT_LIFTABLE, lambda s: s.target.can.movable),
     Requirement(
         FailureCode.TOO_HEAVY,
         lambda s: s.facts.overload_kg(s.target.object_id, 2) <= 0.0,
         ("mass_kg", lambda s: s.facts.overload_kg(s.target.object_id, 2)),
     ),
-    *need(FailureCode.NOT_LIFTABLE, lambda s: s.target.two_handed or s.target.liftable),
+    *need(FailureCode.NOT_LIFTABLE, lambda s: s.target.two_handed or s.target.can.liftable),
     *ACCESSIBLE,
 )

@@ -16,7 +16,7 @@ from proprio_mllm.evaluation.starts import started
 from proprio_mllm.planners.protocol import Planner
 from sim.session.session import Session
 from sim.tasks.task import Task
-from sim.world.metadata import world_metadata
+from sim.world.facts import world_facts
 
 __all__ = ["SimSession", "open_session"]
 
@@ -45,8 +45,7 @@ class SimSession:
 
     def goals(self) -> GoalReport:
         """Which goals hold now."""
-        metadata = world_metadata(self.session.world)
-        met = tuple(goal.holds(metadata) for goal in self.task.goals)
+        met = self.session.goal_status()
         return GoalReport(met, unmet_objects(self.task, met))
 
     def stats(self) -> Stats:
@@ -60,19 +59,18 @@ class SimSession:
         return x, y, yaw, height
 
     def relations(self) -> Mapping[str, Sequence[str]]:
-        """What holds of which objects now, from the simulator's metadata."""
+        """What holds of which objects now, as the simulator knows it."""
         found: dict[str, list[str]] = defaultdict(list)
-        for entry in world_metadata(self.session.world)["objects"]:
-            name = entry["objectId"]
-            if entry["isPickedUp"]:
+        for name, item in world_facts(self.session.world).objects.items():
+            if item.holders:
                 found["held"].append(name)
-            if len(entry["heldBy"]) == 2:
+            if len(item.holders) == 2:
                 found["lifted"].append(name)
-            if entry["openable"]:
-                found["open" if entry["isOpen"] else "closed"].append(name)
-            if entry["toggleable"]:
-                found["switched on" if entry["isToggled"] else "switched off"].append(name)
-            for carrier in entry["parentReceptacles"] or ():
+            if item.can.openable:
+                found["open" if item.open else "closed"].append(name)
+            if item.can.toggleable:
+                found["switched on" if item.on else "switched off"].append(name)
+            for carrier in item.carriers:
                 found[f"on {carrier}"].append(name)
         return dict(found)
 

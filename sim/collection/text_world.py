@@ -20,7 +20,7 @@ from interface.failures import FailureCode
 from interface.steps import Action, PlanStep
 from robots.spec import RobotSpec
 from sim.collection.text_facts import TextFacts
-from sim.expert.jobs import plan_jobs
+from sim.expert.jobs import Setting, plan_jobs
 from sim.tasks.drafts import Draft, Scene
 
 __all__ = ["TextWorld", "feedback_text"]
@@ -164,7 +164,7 @@ class TextWorld:
 
     def done(self) -> bool:
         """Whether every goal holds."""
-        return not plan_jobs(self._draft.goals, self.facts.for_jobs())
+        return not plan_jobs(self._draft.goals, Setting(self.facts.now(), self.facts.homes))
 
     # ---- what actions do
 
@@ -179,7 +179,7 @@ class TextWorld:
         target = action.object_id or ""
         if target and target not in self.known():
             return FailureCode.OBJECT_NOT_KNOWN
-        refusal = first_refusal(action, self.facts)
+        refusal = first_refusal(action, self.facts.now())
         if refusal is not None:
             return refusal.code
         if action.spec.kind is ActionKind.BODY:
@@ -249,15 +249,16 @@ class TextWorld:
 
     def _change(self, action: Action) -> None:
         target = action.object_id or ""
-        held = self.facts.lifted if action.arm is None else self.facts.held(action.arm)
+        state = self.facts.state
+        held = state.lifted if action.arm is None else state.held[action.arm]
         shut = self.facts.hidden
         before = {name for name in self.facts.objs if shut(name)}
         self.facts.succeed(action, self._at or self._scene.surfaces[0])
         if action.spec.has_effect(PutDown) and held is not None:
             self._near.add(held)
-        if held is not None and self.facts.state.is_in(Condition.OPEN, held) is None:  # a door that was let go of
-            self.facts.state.conditions[Condition.OPEN][held] = bool(self._rng.random() < _AJAR[self._solver])
-        if self.facts.state.is_in(Condition.OPEN, target):
+        if held is not None and state.is_in(Condition.OPEN, held) is None:  # a door that was let go of
+            state.conditions[Condition.OPEN][held] = bool(self._rng.random() < _AJAR[self._solver])
+        if state.is_in(Condition.OPEN, target):
             inside = [name for name in self.facts.objs if name in before and not shut(name) and self._rng.random() < 0.8]
             self.seen.update(inside)
             self.visible += [name for name in inside if name not in self.visible]
@@ -283,7 +284,7 @@ class TextWorld:
 
     def _hasty(self, head: Action) -> Action:
         """What the step works towards, before it can be done; of what is not known yet, too."""
-        jobs = plan_jobs(self._draft.goals, self.facts.for_jobs())
+        jobs = plan_jobs(self._draft.goals, Setting(self.facts.now(), self.facts.homes))
         job = jobs[int(self._rng.integers(len(jobs)))]
         return job.action(job.arm or self._any_arm())
 
@@ -304,11 +305,12 @@ class TextWorld:
         """Something that suits a thing that the task names, although it may be done already."""
         item = self.facts.object(self._pick_one(list(self._draft.focus.values())))
         suits = {
-            "GoTo": True, "Open": item.openable, "Close": item.openable,
-            "ToggleOn": item.toggleable, "ToggleOff": item.toggleable,
-            "Pick": item.pickupable, "Hold": item.pickupable, "Lift": item.movable and item.two_handed, "Slice": item.sliceable,
-            "Clean": item.soiled, "UseUp": item.consumable, "Pour": item.fillable and item.movable,
-            "Fill": self.facts.outlet(item.object_id) is not None,
+            "GoTo": True, "Open": item.can.openable, "Close": item.can.openable,
+            "ToggleOn": item.can.toggleable, "ToggleOff": item.can.toggleable,
+            "Pick": item.can.pickupable, "Hold": item.can.pickupable, "Lift": item.can.movable and item.two_handed,
+            "Slice": item.can.sliceable,
+            "Clean": item.soiled, "UseUp": item.can.consumable, "Pour": item.can.fillable and item.can.movable,
+            "Fill": item.outlet is not None,
         }  # fmt: skip
         others = (spec for spec in ACTIONS.values() if spec.takes_object and spec.tool is None and not spec.has_effect(PutDown))
         suits |= {spec.name: True for spec in others if spec.name not in suits}

@@ -22,14 +22,14 @@ from interface.bodies import Arm
 from interface.effects import PutDown
 from interface.failures import FailureCode
 from interface.steps import Action, PlanStep
-from sim.expert.jobs import Facts, Job, plan_jobs
+from sim.expert.jobs import Job, Setting, plan_jobs
 from sim.expert.lookahead import HEIGHT_STEP_M, Rehearsal
 from sim.session.session import Session
 from sim.skills.failures import SkillFailure
 from sim.skills.navigation import Stance, wrap_angle
 from sim.skills.registry import excludes
 from sim.tasks.predicates import Predicate
-from sim.world.metadata import world_metadata
+from sim.world.facts import world_facts
 
 __all__ = ["Expert"]
 
@@ -153,29 +153,9 @@ class Expert:
         self._proposed = ""
         self._homes = {placement.object_id: placement.receptacle for placement in self._session.task.placements or ()}
 
-    def facts(self) -> Facts:
-        """What the planner reads from the simulator."""
-        session = self._session
-        objects = {entry["objectId"]: entry for entry in world_metadata(session.world)["objects"]}
-        lifted = session.body.hands.lifted
-        heavy = session.world.containment.needs_two_hands
-        two_handed = frozenset(name for name, item in session.world.objects.items() if item.movable and heavy(name))
-        held = {arm: None if item == lifted else item for arm, item in session.body.hands.held.items()}
-        objs = session.world.objects
-        links = session.world.room.links
-        return Facts(
-            objects,
-            held,
-            lifted,
-            two_handed,
-            self._homes,
-            uncovered=frozenset(name for name, obj in objs.items() if not obj.type.encloses),
-            tools={use: tuple(n for n, obj in objs.items() if obj.type.has(use)) for use in ("cutter", "wiper")},
-            unsteady=frozenset(name for name, obj in objs.items() if obj.type.has("unsteady")),
-            outlets=tuple(n for n in (*links, *objs) if objs[n].type.name in ("Faucet", "CoffeeMachine")),
-            switches={furniture: switch for switch, furniture in links.items()},
-            arms=self._usable,
-        )
+    def setting(self) -> Setting:
+        """What the job planner reads."""
+        return Setting(world_facts(self._session.world), self._homes, self._usable)
 
     def step(self, observation: object = None, feedback: object = None) -> PlanStep:
         """The planner interface; what it is shown does not matter to it."""
@@ -189,11 +169,11 @@ class Expert:
         return step
 
     def _plan(self) -> PlanStep:
-        facts = self.facts()
+        at = self.setting()
         goals = [goal for goal in self._session.task.goals if isinstance(goal, Predicate)]
-        jobs = plan_jobs(goals, facts)
+        jobs = plan_jobs(goals, at)
         self.intent = None
-        if not jobs or self._lost(jobs[0], facts):
+        if not jobs or self._lost(jobs[0], at):
             return _single(Action("Done"))
         self._learn()
         head = jobs[0]
@@ -202,8 +182,8 @@ class Expert:
         if self._takes_unusable(head):
             return _single(Action("Done"))
         if head.target not in self._session.known_objects:
-            return _single(self._find(head.target, facts))
-        arms = self._arms(head, facts)
+            return _single(self._find(head.target, at))
+        arms = self._arms(head, at)
         if not arms:  # the hands are full of what has to stay in them
             return _single(Action("Done"))
         self.intent = head.action(arms[0])
@@ -213,16 +193,16 @@ class Expert:
             refusal = self._refused_here(action)
             if refusal is None:
                 verdict = self._session.assess(action)
-                if verdict is None and self._leads_on(head, arm, facts):
-                    step = self._with_companion(head, arm, jobs[1:], facts)
+                if verdict is None and self._leads_on(head, arm):
+                    step = self._with_companion(head, arm, jobs[1:], at)
                     if self._lasts(step):
                         return step
                 refusal = _Refusal(action.to_text(), self._here(), verdict)
                 self._memory.refusals.append(refusal)
             if refusal.verdict is not None:
                 verdicts.append(refusal.verdict)
-        together = self._approach_together(head, jobs[1:], facts)
-        return _single(together or self._approach(head, verdicts, facts))
+        together = self._approach_together(head, jobs[1:], at)
+        return _single(together or self._approach(head, verdicts, at))
 
     def _takes_unusable(self, job: Job) -> bool:
         """Whether a job takes an arm that is disabled."""
@@ -264,29 +244,30 @@ class Expert:
         self._memory.attempts[what] = self._memory.attempts.get(what, 0) + 1
         return self._memory.attempts[what] - 1
 
-    def _lost(self, job: Job, facts: Facts) -> bool:
+    def _lost(self, job: Job, at: Setting) -> bool:
         """Whether the job's object lies on the floor, where neither robot reaches, or is broken."""
         if not job.target:
             return False
-        entry = facts.objects[job.target]
-        if not self._session.world.objects[job.target].movable or entry["isPickedUp"]:
+        item = at.objects[job.target]
+        if not item.can.movable or item.picked_up:
             return False
-        return bool(entry["isBroken"]) or (not entry["parentReceptacles"] and entry["center"]["z"] < _FLOOR_M)
+        low, high = self._session.world.poses.bounds(job.target)
+        return item.broken or (not item.carriers and float(low[2] + high[2]) / 2.0 < _FLOOR_M)
 
     # ---- arms
 
-    def _arms(self, job: Job, facts: Facts) -> tuple[Arm | None, ...]:
+    def _arms(self, job: Job, at: Setting) -> tuple[Arm | None, ...]:
         """Arms that may do the job, preferred one first: the one on the target's side, the right one straight ahead."""
         if job.arm is not None:
             return (job.arm,)
         if ACTIONS[job.verb].arms == 2:
             return (None,)
-        free = facts.free_arms()
+        free = at.free_arms()
         if len(free) == 2 and self._bearing_rad(job.target) > np.deg2rad(8.0):
             return (Arm.LEFT, Arm.RIGHT)
         return free
 
-    def _with_companion(self, head: Job, arm: Arm | None, others: Sequence[Job], facts: Facts) -> PlanStep:
+    def _with_companion(self, head: Job, arm: Arm | None, others: Sequence[Job], at: Setting) -> PlanStep:
         """The step for `head`, with a job for the other arm beside it where that is possible right now."""
         if arm is None or head.then is not None:
             return _single(head.action(arm))
@@ -296,12 +277,12 @@ class Expert:
             if job.target not in self._session.known_objects or self._is_far(job.target):
                 continue
             pairs = [(arm, arm.other)]
-            if head.arm is None and job.arm is None and len(facts.free_arms()) == 2:
+            if head.arm is None and job.arm is None and len(at.free_arms()) == 2:
                 pairs.append((arm.other, arm))
                 left_first = self._bearing_rad(head.target) > self._bearing_rad(job.target)
                 pairs.sort(key=lambda pair: (pair[0] is Arm.LEFT) != left_first)
             for mine, other in pairs:
-                if job.arm not in (None, other) or (job.arm is None and other not in facts.free_arms()):
+                if job.arm not in (None, other) or (job.arm is None and other not in at.free_arms()):
                     continue
                 first, second = head.action(mine), job.action(other)
                 if any(self._refused_here(action) for action in (first, second)):
@@ -318,15 +299,15 @@ class Expert:
 
     # ---- the body
 
-    def _follow_up(self, job: Job, arm: Arm | None, facts: Facts) -> Action | None:
+    def _follow_up(self, job: Job, arm: Arm | None) -> Action | None:
         """What the other arm does after a job that makes it possible, None when nothing has to follow."""
         if job.then is None or arm is None:
             return None
         return job.then.action(job.then.arm or arm.other)
 
-    def _leads_on(self, job: Job, arm: Arm | None, facts: Facts) -> bool:
+    def _leads_on(self, job: Job, arm: Arm | None) -> bool:
         """Whether what has to follow a job can be done from here as well."""
-        following = self._follow_up(job, arm, facts)
+        following = self._follow_up(job, arm)
         if following is None:
             return True
         return following.arm in self._usable and self._rehearsal.leads_to(job.action(arm), following)
@@ -336,9 +317,9 @@ class Expert:
         both = any(action.spec.arms == 2 and action.spec.has_effect(PutDown) for action in step.actions)
         return not both or self._rehearsal.succeeds(step)
 
-    def _approach_for_two(self, job: Job, facts: Facts) -> Action:
+    def _approach_for_two(self, job: Job, at: Setting) -> Action:
         """The body action towards a place from where one arm can do a job and the other what follows it."""
-        pairs = [(job.action(arm), self._follow_up(job, arm, facts)) for arm in self._arms(job, facts)]
+        pairs = [(job.action(arm), self._follow_up(job, arm)) for arm in self._arms(job, at)]
         pairs = [(first, then) for first, then in pairs if then is not None and then.arm in self._usable]
         if not pairs or self._count(f"stance {job.target}") >= _PATIENCE:
             return Action("Done")
@@ -367,7 +348,7 @@ class Expert:
             if stance is not None:
                 yield option, stance
 
-    def _approach_together(self, head: Job, others: Sequence[Job], facts: Facts) -> Action | None:
+    def _approach_together(self, head: Job, others: Sequence[Job], at: Setting) -> Action | None:
         """A walk to where both arms can work at once, None when there is nothing for the other arm or no such place.
 
         It is thought about once for every pair of targets.
@@ -417,15 +398,15 @@ class Expert:
         gap = body.objects.interaction_point(head.target)[:2] - body.objects.interaction_point(other.target)[:2]
         return len(self._usable) == 2 and float(np.hypot(*gap)) < _TOGETHER_M
 
-    def _approach(self, job: Job, verdicts: Sequence[SkillFailure], facts: Facts) -> Action:
+    def _approach(self, job: Job, verdicts: Sequence[SkillFailure], at: Setting) -> Action:
         """The body action that brings a known target into reach."""
-        at_door = next((arm for arm, item in facts.held.items() if item is not None and facts.in_place(item)), None)
+        at_door = next((arm for arm, item in at.facts.held.items() if item is not None and at.in_place(item)), None)
         if at_door is not None:  # a hand that holds something where it is keeps the robot there
             return Action("Release", arm=at_door)
         if self._stuck() and self._count("back off") < _RETREATS:
             return Action("MoveBack", amount=_BACK_M)
         if job.then is not None:
-            return self._approach_for_two(job, facts)
+            return self._approach_for_two(job, at)
         target = job.target
         wrong = next((verdict for verdict in verdicts if verdict.code in _WRONG_HEIGHT), None)
         if wrong is not None and self._count(f"height {target}") < _HEIGHT_TRIALS:
@@ -437,7 +418,7 @@ class Expert:
         attempt = self._count(f"stance {target}")
         if attempt >= _PATIENCE:
             return Action("Done")
-        actions = [job.action(arm) for arm in self._arms(job, facts)]
+        actions = [job.action(arm) for arm in self._arms(job, at)]
         options = [Action("GoTo", object_id=target, amount=d, bearing_deg=b) for d, b in _STANCES]
         tried = self._memory.gone.setdefault(target, set())
         fresh = [option for option in options if option.to_text() not in tried]
@@ -485,10 +466,10 @@ class Expert:
         amount = max(0.01, round(min(steps * HEIGHT_STEP_M, room), 2))
         return Action("MoveUp" if height_m > 0 else "MoveDown", amount=amount)
 
-    def _find(self, target: str, facts: Facts) -> Action:
+    def _find(self, target: str, at: Setting) -> Action:
         """Goes to where an object is that the robot has not seen yet, and looks around there."""
         known = self._session.known_objects
-        carrier = next((c for c in facts.objects[target]["parentReceptacles"] or () if c in known), None)
+        carrier = next((c for c in at.objects[target].carriers if c in known), None)
         attempt = self._count(f"find {target}")
         if attempt == 0 and carrier is not None:
             return Action("GoTo", object_id=carrier)

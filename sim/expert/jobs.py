@@ -1,6 +1,6 @@
 """What is left to do: from goals and object states to an ordered list of arm jobs.
 
-Pure functions over metadata, no physics: the expert (`sim.expert.expert`) asks here what comes next and decides itself where to
+Pure functions over facts, no physics: the expert (`sim.expert.expert`) asks here what comes next and decides itself where to
 stand. Order is canonical, so that demonstrations are regular: switches and doors that the goal asks for, then work with tools
 and liquids, then small objects (pick all that the hands can take, then put them down), then doors to close, then things that
 take two hands, then what has to stay in the hands at the end. A door that falls shut is held open by one hand while the other
@@ -10,16 +10,17 @@ one reaches through it, and what would roll away under a tool is held by one han
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final
 
 from interface.actions import ACTIONS, ActionKind, bringing_about
 from interface.bodies import Arm
 from interface.effects import Condition
+from interface.facts import Facts, ObjectFacts
 from interface.steps import Action
 from sim.tasks.predicates import Predicate
 
-__all__ = ["Facts", "Job", "pending_leaves", "plan_jobs"]
+__all__ = ["Job", "Setting", "pending_leaves", "plan_jobs"]
 
 _NEGATION: Final = {"open": "closed", "closed": "open", "toggled_on": "toggled_off", "toggled_off": "toggled_on"}
 #: What a hand has to hold to bring a state about, and the action that does.
@@ -54,67 +55,39 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
-    """The states that decide what comes next.
+class Setting:
+    """What decides what comes next.
 
     Attributes:
-        objects: AI2-THOR metadata by object id.
-        held: object in each hand, None for an empty one; a lifted object is in `lifted`, not here. Furniture is in a hand that
-            holds its door.
-        lifted: object in both hands.
-        two_handed: ids that need both hands.
+        facts: the world.
         homes: where each object stood at the start, to put strays back.
-        uncovered: ids that open but shut nothing away: a closed one is in nobody's way.
-        tools: ids by what they are good for, `cutter` and `wiper`.
-        unsteady: ids that roll or slide away under a tool.
-        outlets: ids that a liquid comes out of when they are switched on, and burners with the knob that heats them.
-        switches: switch by the furniture that it works on, where that is another object.
-        arms: arms that can be used.
+        arms: arms that can be used, the preferred one first.
     """
 
-    objects: Mapping[str, Mapping[str, Any]]
-    held: Mapping[Arm, str | None]
-    lifted: str | None
-    two_handed: frozenset[str]
+    facts: Facts
     homes: Mapping[str, str]
-    uncovered: frozenset[str] = frozenset()
-    tools: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    unsteady: frozenset[str] = frozenset()
-    outlets: tuple[str, ...] = ()
-    switches: Mapping[str, str] = field(default_factory=dict)
     arms: tuple[Arm, ...] = (Arm.RIGHT, Arm.LEFT)
 
-    def closed_carrier(self, object_id: str) -> str | None:
-        """The closed receptacle around an object, if any."""
-        for carrier in self.objects[object_id]["parentReceptacles"] or ():
-            if self.is_closed(carrier):
-                return carrier
-        return None
+    @property
+    def objects(self) -> Mapping[str, ObjectFacts]:
+        """The world's objects."""
+        return self.facts.objects
 
-    def is_closed(self, object_id: str) -> bool:
-        """Whether the object is closed and its contents are out of reach."""
-        entry = self.objects[object_id]
-        return bool(entry["openable"]) and not entry["isOpen"] and object_id not in self.uncovered
-
-    def falls_shut(self, object_id: str) -> bool:
-        """Whether its door or drawer shuts as soon as nothing holds it open."""
-        return bool(self.objects[object_id].get("selfClosing", False))
+    def made_for(self, use: str) -> list[str]:
+        """Tools for a use of the table of actions, `cutter` or `wiper`."""
+        return [name for name, item in self.objects.items() if getattr(item.can, use)]
 
     def free_arms(self) -> tuple[Arm, ...]:
-        """Empty hands, the right one first."""
-        return () if self.lifted else tuple(arm for arm in self.arms if self.held[arm] is None)
-
-    def arm_with(self, object_id: str) -> Arm | None:
-        """The arm that holds an object."""
-        return next((arm for arm, item in self.held.items() if item == object_id), None)
+        """Usable arms with an empty hand, the preferred one first."""
+        return tuple(arm for arm in self.arms if arm in self.facts.free_arms())
 
     def in_place(self, object_id: str) -> bool:
         """Whether a held object still rests where it was, as Hold leaves it, or is furniture."""
-        entry = self.objects[object_id]
-        return bool(entry["parentReceptacles"]) or not (entry["pickupable"] or entry["moveable"])
+        item = self.objects[object_id]
+        return bool(item.carriers) or not item.can.movable
 
 
-def pending_leaves(goals: Sequence[Predicate], objects: Mapping[str, Mapping[str, Any]]) -> list[Predicate]:
+def pending_leaves(goals: Sequence[Predicate], objects: Mapping[str, ObjectFacts]) -> list[Predicate]:
     """The leaf conditions that still have to be made true, in goal order.
 
     Of an `or` the first operand is taken, of a `count` or an `exists` as many as are missing.
@@ -122,10 +95,9 @@ def pending_leaves(goals: Sequence[Predicate], objects: Mapping[str, Mapping[str
     Raises:
         ValueError: on a `not` that names no state to bring about.
     """
-    metadata = {"objects": list(objects.values())}
     leaves: list[Predicate] = []
     for goal in goals:
-        if goal.holds(metadata):
+        if goal.holds(objects):
             continue
         if goal.kind == "and":
             leaves += pending_leaves(goal.of, objects)
@@ -133,8 +105,8 @@ def pending_leaves(goals: Sequence[Predicate], objects: Mapping[str, Mapping[str
             leaves += pending_leaves(goal.of[:1], objects)
         elif goal.kind in ("count", "exists"):
             operands = goal.candidates(objects) if goal.kind == "exists" else goal.of
-            missing = goal.at_least - sum(operand.holds(metadata) for operand in operands)
-            leaves += pending_leaves([operand for operand in operands if not operand.holds(metadata)][:missing], objects)
+            missing = goal.at_least - sum(operand.holds(objects) for operand in operands)
+            leaves += pending_leaves([operand for operand in operands if not operand.holds(objects)][:missing], objects)
         elif goal.kind == "not":
             operand = goal.of[0]
             if operand.kind not in _NEGATION:
@@ -145,49 +117,49 @@ def pending_leaves(goals: Sequence[Predicate], objects: Mapping[str, Mapping[str
     return leaves
 
 
-def plan_jobs(goals: Sequence[Predicate], facts: Facts) -> list[Job]:
+def plan_jobs(goals: Sequence[Predicate], at: Setting) -> list[Job]:
     """Jobs that can be done now; the first one has priority, the others may run beside it on the other arm.
 
     Returns:
         An empty list when all goals hold.
     """
-    leaves = pending_leaves(goals, facts.objects)
+    leaves = pending_leaves(goals, at.objects)
     if not leaves:
         return []
-    if facts.lifted is not None:
-        return [_put_down_lifted(leaves, facts)]
-    through = _through_held_door(leaves, facts)
+    if at.facts.lifted is not None:
+        return [_put_down_lifted(leaves, at)]
+    through = _through_held_door(leaves, at)
     if through:
         return through
     moves = [leaf for leaf in leaves if leaf.kind in ("on", "in")]
-    heavy = [leaf for leaf in moves if leaf.object_id in facts.two_handed]
-    light = [leaf for leaf in moves if leaf.object_id not in facts.two_handed]
-    strays = _strays(goals, leaves, light, facts)
+    heavy = [leaf for leaf in moves if at.objects[leaf.object_id].two_handed]
+    light = [leaf for leaf in moves if not at.objects[leaf.object_id].two_handed]
+    strays = _strays(goals, leaves, light, at)
     if strays:
         return strays
-    work = _work_jobs(leaves, facts)
+    work = _work_jobs(leaves, at)
     if work:
         return work
-    free = bool(facts.free_arms())
+    free = bool(at.free_arms())
     jobs: list[Job] = []
     if free:
         jobs += [Job("ToggleOn", leaf.object_id) for leaf in leaves if leaf.kind == "toggled_on"]
         jobs += [Job("ToggleOff", leaf.object_id) for leaf in leaves if leaf.kind == "toggled_off"]
         jobs += [Job("Open", leaf.object_id) for leaf in leaves if leaf.kind == "open"]
-    jobs += _light_jobs(light, facts)
+    jobs += _light_jobs(light, at)
     if free and not light:
         jobs += [Job("Close", leaf.object_id) for leaf in leaves if leaf.kind == "closed"]
     if jobs:
-        return _with_picks(jobs, leaves, facts)
+        return _with_picks(jobs, leaves, at)
     for leaf in heavy:
-        if facts.is_closed(leaf.receptacle_id):
+        if at.objects[leaf.receptacle_id].shut:
             return [Job("Open", leaf.receptacle_id)]
         return [Job("Lift", leaf.object_id)]
-    picks = _held_jobs(leaves, facts)
+    picks = _held_jobs(leaves, at)
     return (
         picks
         or [Job("Lift", leaf.object_id) for leaf in leaves if leaf.kind == "lifted"]
-        or [Job("ResetArm", "", facts.arms[0]) for leaf in leaves if leaf.kind == "cooked"]  # it takes time
+        or [Job("ResetArm", "", at.arms[0]) for leaf in leaves if leaf.kind == "cooked"]  # it takes time
     )
 
 
@@ -195,152 +167,154 @@ def _all_leaves(goals: Sequence[Predicate]) -> list[Predicate]:
     return [leaf for goal in goals for leaf in (_all_leaves(goal.of) if goal.of else [goal])]
 
 
-def _strays(goals: Sequence[Predicate], leaves: Sequence[Predicate], light: Sequence[Predicate], facts: Facts) -> list[Job]:
+def _strays(goals: Sequence[Predicate], leaves: Sequence[Predicate], light: Sequence[Predicate], at: Setting) -> list[Job]:
     """Putting away, or letting go of, what no goal wants in a hand."""
     kept = {goal.object_id for goal in _all_leaves(goals) if goal.kind == "held"} | {leaf.object_id for leaf in light}
     if any(leaf.kind == "filled" for leaf in leaves):  # the vessel, and what it may be filled from
         kept |= {leaf.object_id for leaf in leaves if leaf.kind == "filled"}
-        kept |= {item for item in facts.held.values() if item is not None and facts.objects[item]["isFilledWithLiquid"]}
+        kept |= {item for item in at.facts.held.values() if item is not None and at.objects[item].filled}
     for leaf in leaves:
         if leaf.kind in _TOOL_WORK:
-            kept |= {leaf.object_id, *facts.tools.get(_TOOL_WORK[leaf.kind][0], ())}
-    for arm, item in facts.held.items():
+            kept |= {leaf.object_id, *at.made_for(_TOOL_WORK[leaf.kind][0])}
+    for arm, item in at.facts.held.items():
         if item is None or item in kept:
             continue
-        if facts.in_place(item):
+        if at.in_place(item):
             return [Job("Release", "", arm)]
-        return _through_door(Job("Place", facts.homes[item], arm), facts)
+        return _through_door(Job("Place", at.homes[item], arm), at)
     return []
 
 
-def _through_held_door(leaves: Sequence[Predicate], facts: Facts) -> list[Job]:
+def _through_held_door(leaves: Sequence[Predicate], at: Setting) -> list[Job]:
     """What is left to do through a door that a hand holds open; letting go of it when nothing is."""
-    for arm, door in facts.held.items():
-        if door is None or not facts.falls_shut(door):
+    for arm, door in at.facts.held.items():
+        if door is None or not at.objects[door].self_closing:
             continue
         for leaf in leaves:
-            bearer = facts.arm_with(leaf.object_id)
+            bearer = at.facts.arm_with(leaf.object_id)
             if leaf.kind in ("on", "in") and leaf.receptacle_id == door and bearer is not None:
                 return [Job("Place", door, bearer)]
-            inside = door in (facts.objects[leaf.object_id]["parentReceptacles"] or ())
-            if leaf.kind in ("held", "on", "in") and leaf.receptacle_id != door and inside and facts.free_arms():
+            inside = door in at.objects[leaf.object_id].carriers
+            if leaf.kind in ("held", "on", "in") and leaf.receptacle_id != door and inside and at.free_arms():
                 return [Job("Pick", leaf.object_id)]
         return [Job("Release", "", arm)]
     return []
 
 
-def _put_down_lifted(leaves: Sequence[Predicate], facts: Facts) -> Job:
+def _put_down_lifted(leaves: Sequence[Predicate], at: Setting) -> Job:
     for leaf in leaves:
-        if leaf.kind in ("on", "in") and leaf.object_id == facts.lifted:
+        if leaf.kind in ("on", "in") and leaf.object_id == at.facts.lifted:
             return Job("PlaceBoth", leaf.receptacle_id)
-    home = facts.homes.get(facts.lifted or "")
-    open_places = (name for name, entry in facts.objects.items() if entry["receptacle"] and not entry["moveable"]
-                   and not entry["pickupable"] and not facts.is_closed(name))  # fmt: skip
+    home = at.homes.get(at.facts.lifted or "")
+    open_places = (name for name, item in at.objects.items() if item.can.receptacle and not item.can.movable
+                   and not at.objects[name].shut)  # fmt: skip
     return Job("PlaceBoth", home if home is not None else next(open_places))
 
 
-def _through_door(job: Job, facts: Facts) -> list[Job]:
+def _through_door(job: Job, at: Setting) -> list[Job]:
     """The job, or the opening of the receptacle that it needs first."""
-    door = job.target if job.verb == "Place" and facts.is_closed(job.target) else None
+    door = job.target if job.verb == "Place" and at.objects[job.target].shut else None
     if job.verb == "Pick":
-        door = facts.closed_carrier(job.target)
-    if door is None or not facts.free_arms():
+        door = at.facts.shut_around(job.target)
+    if door is None or not at.free_arms():
         return [job]
-    return [Job("Open", door, then=job if facts.falls_shut(door) else None)]
+    return [Job("Open", door, then=job if at.objects[door].self_closing else None)]
 
 
 # ---- tools, liquids, heat
 
 
-def _work_jobs(leaves: Sequence[Predicate], facts: Facts) -> list[Job]:
+def _work_jobs(leaves: Sequence[Predicate], at: Setting) -> list[Job]:
     """The next step towards the first state that takes a tool, a vessel or heat."""
     for leaf in leaves:
         if leaf.kind in _TOOL_WORK:
-            return _tool_jobs(leaf, facts)
+            return _tool_jobs(leaf, at)
         if leaf.kind == "filled":
-            return _fill_jobs(leaf.object_id, facts)
-        if leaf.kind == "used_up" and facts.free_arms():
+            return _fill_jobs(leaf.object_id, at)
+        if leaf.kind == "used_up" and at.free_arms():
             return [Job("UseUp", leaf.object_id)]
         if leaf.kind == "cooked":
-            job = _heat_job(leaf.object_id, facts)
+            job = _heat_job(leaf.object_id, at)
             if job is not None:
                 return [job]
     return []
 
 
-def _tool_jobs(leaf: Predicate, facts: Facts) -> list[Job]:
+def _tool_jobs(leaf: Predicate, at: Setting) -> list[Job]:
     use, verb = _TOOL_WORK[leaf.kind]
-    tools = facts.tools.get(use, ())
-    arm = next((arm for arm, item in facts.held.items() if item in tools), None)
+    tools = at.made_for(use)
+    arm = next((arm for arm, item in at.facts.held.items() if item in tools), None)
     if arm is None:
-        return _through_door(Job("Pick", tools[0]), facts) if tools else []
+        return _through_door(Job("Pick", tools[0]), at) if tools else []
     work = Job(verb, leaf.object_id, arm)
-    if leaf.object_id in facts.unsteady and facts.arm_with(leaf.object_id) is None:
+    if at.objects[leaf.object_id].can.unsteady and at.facts.arm_with(leaf.object_id) is None:
         return [Job("Hold", leaf.object_id, arm.other, then=work)]
     return [work]
 
 
-def _fill_jobs(vessel: str, facts: Facts) -> list[Job]:
+def _fill_jobs(vessel: str, at: Setting) -> list[Job]:
     """Filling a vessel: from another one that holds a liquid, else at an outlet."""
-    bearer = facts.arm_with(vessel)
+    bearer = at.facts.arm_with(vessel)
     full = [
         name
-        for name, entry in facts.objects.items()
-        if name != vessel and entry["isFilledWithLiquid"] and entry["pickupable"] and name not in facts.two_handed
+        for name, item in at.objects.items()
+        if name != vessel and item.filled and item.can.pickupable and not item.two_handed
     ]
     if full and bearer is None:
-        arm = facts.arm_with(full[0])
+        arm = at.facts.arm_with(full[0])
         return [Job("Pick", full[0])] if arm is None else [Job("Pour", vessel, arm)]
-    if not facts.outlets:
+    outlets = [name for name, item in at.objects.items() if item.can.toggleable and item.outlet == name]
+    if not outlets:
         return []
     if bearer is None:
-        return _through_door(Job("Pick", vessel), facts)
-    outlet = facts.outlets[0]
-    if not facts.objects[outlet]["isToggled"] and facts.free_arms():
+        return _through_door(Job("Pick", vessel), at)
+    outlet = outlets[0]
+    if not at.objects[outlet].on and at.free_arms():
         return [Job("ToggleOn", outlet)]
     return [Job("Fill", outlet, bearer)]
 
 
-def _heat_job(food: str, facts: Facts) -> Job | None:
+def _heat_job(food: str, at: Setting) -> Job | None:
     """Closing and switching on what the food lies in or on; None while it is on no heat source, or when it is being heated."""
-    for place in facts.objects[food]["parentReceptacles"] or ():
-        if not facts.objects[place]["isHeatSource"] or facts.objects[food]["isPickedUp"]:
+    for place in at.objects[food].carriers:
+        item = at.objects[place]
+        if not item.can.heat_source or at.objects[food].picked_up:
             continue
-        if facts.objects[place]["openable"] and facts.objects[place]["isOpen"]:
+        if item.open:
             return Job("Close", place)
-        if not facts.objects[place]["isToggled"]:
-            return Job("ToggleOn", facts.switches.get(place, place))
+        if not item.on:
+            return Job("ToggleOn", item.switch or place)
     return None
 
 
 # ---- carrying
 
 
-def _light_jobs(light: Sequence[Predicate], facts: Facts) -> list[Job]:
+def _light_jobs(light: Sequence[Predicate], at: Setting) -> list[Job]:
     """Carrying small objects: fill the hands first, but keep one free for a door that is still closed."""
-    arm_of = {item: arm for arm, item in facts.held.items() if item is not None}
+    arm_of = {item: arm for arm, item in at.facts.held.items() if item is not None}
     waiting = [leaf for leaf in light if leaf.object_id not in arm_of]
     in_hand = [leaf for leaf in light if leaf.object_id in arm_of]
-    door_ahead = any(facts.is_closed(leaf.receptacle_id) for leaf in in_hand)
-    if waiting and facts.free_arms() and not door_ahead:
-        closed = [leaf.receptacle_id for leaf in waiting if facts.is_closed(leaf.receptacle_id)]
-        ajar = [door for door in closed if not facts.falls_shut(door)]
-        if ajar and not in_hand and (len(waiting) > 1 or len(facts.arms) == 1):
+    door_ahead = any(at.objects[leaf.receptacle_id].shut for leaf in in_hand)
+    if waiting and at.free_arms() and not door_ahead:
+        closed = [leaf.receptacle_id for leaf in waiting if at.objects[leaf.receptacle_id].shut]
+        ajar = [door for door in closed if not at.objects[door].self_closing]
+        if ajar and not in_hand and (len(waiting) > 1 or len(at.arms) == 1):
             return [Job("Open", ajar[0])]  # nothing is free for the door later
-        room = 1 if closed else len(facts.free_arms())
-        jobs = [job for leaf in waiting for job in _through_door(Job("Pick", leaf.object_id), facts)]
+        room = 1 if closed else len(at.free_arms())
+        jobs = [job for leaf in waiting for job in _through_door(Job("Pick", leaf.object_id), at)]
         return list(dict.fromkeys(jobs))[:room]
-    places = [job for leaf in in_hand for job in _through_door(Job("Place", leaf.receptacle_id, arm_of[leaf.object_id]), facts)]
+    places = [job for leaf in in_hand for job in _through_door(Job("Place", leaf.receptacle_id, arm_of[leaf.object_id]), at)]
     return list(dict.fromkeys(places))
 
 
-def _held_jobs(leaves: Sequence[Predicate], facts: Facts) -> list[Job]:
-    jobs = [job for leaf in leaves if leaf.kind == "held" for job in _through_door(Job("Pick", leaf.object_id), facts)]
+def _held_jobs(leaves: Sequence[Predicate], at: Setting) -> list[Job]:
+    jobs = [job for leaf in leaves if leaf.kind == "held" for job in _through_door(Job("Pick", leaf.object_id), at)]
     return list(dict.fromkeys(jobs))
 
 
-def _with_picks(jobs: list[Job], leaves: Sequence[Predicate], facts: Facts) -> list[Job]:
+def _with_picks(jobs: list[Job], leaves: Sequence[Predicate], at: Setting) -> list[Job]:
     """Adds picking up as a possible companion of a switch or a door, when both hands are free for it."""
-    if len(jobs) == 1 and len(facts.free_arms()) == 2 and jobs[0].verb in ("Open", "Close", "ToggleOn", "ToggleOff"):
-        return jobs + [job for job in _held_jobs(leaves, facts) if job.verb == "Pick"][:1]
+    if len(jobs) == 1 and len(at.free_arms()) == 2 and jobs[0].verb in ("Open", "Close", "ToggleOn", "ToggleOff"):
+        return jobs + [job for job in _held_jobs(leaves, at) if job.verb == "Pick"][:1]
     return jobs

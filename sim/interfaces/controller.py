@@ -26,12 +26,12 @@ from interface.failures import FailureCode
 from interface.feedback import ActionOutcome
 from interface.steps import Action, PlanStep
 from sim.interfaces.aliases import number, to_action
+from sim.interfaces.metadata import world_metadata
 from sim.interfaces.poses import interactable_poses, random_placements, set_object_poses
 from sim.scene.rooms import load_room
 from sim.session.session import FreePlay, Session, SessionSnapshot, TaskLike
 from sim.session.undo import UndoHistory
 from sim.skills.navigation import wrap_angle
-from sim.world.metadata import world_metadata
 from sim.world.rendering import MAX_SIZE
 
 __all__ = ["THOR_CODES", "Controller", "Event"]

@@ -30,10 +30,10 @@ from interface.feedback import ActionOutcome
 from interface.steps import Action, PlanStep
 from sim.interfaces.aliases import to_action
 from sim.interfaces.controller import Stopped
+from sim.interfaces.metadata import world_metadata
 from sim.interfaces.poses import interactable_poses
 from sim.session.session import FreePlay, Session, SessionSnapshot
 from sim.skills.locomotion import best_stance
-from sim.world.metadata import world_metadata
 
 __all__ = ["SCENES", "Controller"]
 
@@ -254,7 +254,7 @@ class Controller(Stopped):
     def _serves(self, name: str) -> bool:
         """Whether what can be done with an object is within an arm's reach from here."""
         obj = self.session.world.objects[name]
-        verbs = ["Pick"] * obj.type.pickupable + ["ToggleOff" if obj.is_toggled else "ToggleOn"] * (obj.toggle_site >= 0)
+        verbs = ["Pick"] * obj.type.pickupable + ["ToggleOff" if obj.state.isToggled else "ToggleOn"] * (obj.toggle_site >= 0)
         verbs += ["Close" if obj.is_open else "Open"] * bool(obj.moving)
         actions = [Action(verb, arm=arm, object_id=name) for verb in verbs for arm in Arm]
         actions += [Action("Lift", object_id=name)] * (obj.movable and not obj.type.pickupable)

@@ -25,8 +25,8 @@ from sim.scene.rooms import room_names
 from sim.session.contingency import DIFFICULTIES
 from sim.session.session import FreePlay, Session, TaskLike
 from sim.session.undo import UndoHistory
-from sim.skills.facts import WorldFacts
 from sim.tasks.task import Task, load_benchmark
+from sim.world.facts import world_facts
 
 __all__ = ["BusyError", "Game", "PlayConfig"]
 
@@ -263,7 +263,7 @@ class Game:
     def _possible(self) -> Mapping[str, list[str]]:
         """Per object the actions that nothing but reach and room to move may refuse now."""
         session = self._running()
-        facts = WorldFacts(session.body)
+        facts = world_facts(session.world)
         found: dict[str, list[str]] = {name: [] for name in session.known_objects}
         for name, spec in ACTIONS.items():
             if not spec.takes_object:

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from interface.facts import Affordances
 from sim.scene.catalogue import Catalogue, MovingSpec, ObjectType, SurfaceSpec
 
 __all__ = [
@@ -134,6 +135,7 @@ class ObjectInstance:
         object_id: `Type_n`.
         type: its catalogue type.
         movable: whether it has a free joint in this scene.
+        can: what can be done with it.
         body_id: MuJoCo body.
         body_ids: the body and its doors, drawers and lids.
         geom_ids: all geoms.
@@ -152,6 +154,7 @@ class ObjectInstance:
     object_id: str
     type: ObjectType
     movable: bool
+    can: Affordances
     body_id: int
     body_ids: tuple[int, ...]
     geom_ids: NDArray[np.int64]
@@ -182,16 +185,6 @@ class ObjectInstance:
     def laden_mass_kg(self) -> float:
         """Mass with the liquid that it holds; the liquid of furniture does not weigh."""
         return self.mass_kg + (self.state.fillLitres if self.movable else 0.0)
-
-    @property
-    def is_broken(self) -> bool:
-        """Whether it is broken."""
-        return self.state.isBroken
-
-    @property
-    def is_toggled(self) -> bool:
-        """Whether it is switched on."""
-        return self.state.isToggled
 
     @property
     def footprint_radius_m(self) -> float:
@@ -231,6 +224,7 @@ def index_object(model: mujoco.MjModel, object_id: str, catalogue: Catalogue) ->
         object_id=object_id,
         type=kind,
         movable=movable,
+        can=kind.affordances(movable),
         body_id=body,
         body_ids=bodies,
         geom_ids=geoms,

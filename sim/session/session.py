@@ -13,7 +13,7 @@ import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from interface.actions import ActionKind
 from interface.bodies import Arm
 from interface.effects import PutDown
 from interface.episode import STEP_LIMIT
+from interface.facts import ObjectFacts
 from interface.feedback import ActionOutcome, Feedback
 from interface.observation import HistoryItem, Observation
 from interface.steps import Action, PlanStep
@@ -34,7 +35,7 @@ from sim.skills.body.ready import ready_posture
 from sim.skills.failures import SkillFailure
 from sim.skills.registry import assess_action, skills_for
 from sim.skills.runner import CONTROL_DT_S, Skill, run_skills
-from sim.world.metadata import world_metadata
+from sim.world.facts import world_facts
 from sim.world.snapshot import WorldSnapshot
 from sim.world.world import World
 
@@ -42,10 +43,10 @@ __all__ = ["FreePlay", "Session", "SessionSnapshot", "SessionStats", "TaskLike"]
 
 
 class GoalLike(Protocol):
-    """A condition on the scene's metadata; `sim.tasks.predicates.Predicate` is one."""
+    """A condition on a world; `sim.tasks.predicates.Predicate` is one."""
 
-    def holds(self, metadata: Mapping[str, Any]) -> bool:
-        """Whether it is true."""
+    def holds(self, objects: Mapping[str, ObjectFacts]) -> bool:
+        """Whether it is true of the world's objects, by id."""
         ...
 
 
@@ -355,8 +356,8 @@ class Session:
 
     def goal_status(self) -> tuple[bool, ...]:
         """Whether each of the task's goals holds."""
-        metadata = world_metadata(self.world)
-        return tuple(goal.holds(metadata) for goal in self.task.goals)
+        objects = world_facts(self.world).objects
+        return tuple(goal.holds(objects) for goal in self.task.goals)
 
     @property
     def succeeded(self) -> bool:

@@ -25,8 +25,7 @@ from interface.failures import FailureCode
 from interface.steps import Action
 from sim.scene.objects import MovingPart, ObjectInstance
 from sim.skills.body.body import Body
-from sim.skills.facts import require
-from sim.skills.failures import SkillFailure
+from sim.skills.failures import SkillFailure, require
 from sim.skills.lids import closed_on, led_on, plan_lead, plan_tab
 from sim.skills.locomotion import sweep
 from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, stow
@@ -137,7 +136,7 @@ def assess_open_close(body: Body, action: Action) -> Pull | Push:
     """
     assert action.arm is not None and action.object_id is not None
     arm, obj, opening = action.arm, body.obj(action.object_id), action.name == "Open"
-    require(body, action)
+    require(body.world, action)
     part = obj.moving[0]
     handle = body.world.data.site_xpos[part.handle_site].copy()
     low, high = part.range
@@ -380,7 +379,7 @@ def assess_toggle(body: Body, action: Action) -> Reach:
     """
     assert action.arm is not None and action.object_id is not None
     arm, obj = action.arm, body.obj(action.object_id)
-    require(body, action)
+    require(body.world, action)
     return plan_press(body, arm, body.world.poses.toggle_point(obj.object_id), (obj.object_id,))
 
 

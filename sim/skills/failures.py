@@ -1,14 +1,17 @@
-"""How a skill ends: by a failure code with its margins, or by success."""
+"""How a skill ends: refused before it moves, by a failure code with its margins, or by success."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
+from interface.actions import first_refusal
 from interface.failures import FAILURES, FailureCode
 from interface.feedback import ActionOutcome, category_of
 from interface.steps import Action
+from sim.world.facts import world_facts
+from sim.world.world import World
 
-__all__ = ["SkillFailure", "failed", "succeeded"]
+__all__ = ["SkillFailure", "failed", "require", "succeeded"]
 
 
 class SkillFailure(Exception):  # noqa: N818  # a failed skill is an outcome, not an error
@@ -29,6 +32,17 @@ class SkillFailure(Exception):  # noqa: N818  # a failed skill is an outcome, no
         self.code = code
         self.margins = dict(margins or {})
         self.contingency = contingency
+
+
+def require(world: World, action: Action) -> None:
+    """Refuses an action whose preconditions do not hold.
+
+    Raises:
+        SkillFailure: the code of the first one that does not, with its margin.
+    """
+    refusal = first_refusal(action, world_facts(world))
+    if refusal is not None:
+        raise SkillFailure(refusal.code, dict(refusal.margins))
 
 
 def failed(action: Action, failure: SkillFailure) -> ActionOutcome:

@@ -11,8 +11,7 @@ from interface.failures import FailureCode
 from interface.steps import Action
 from sim.skills.articulate import plan_handle
 from sim.skills.body.body import Body
-from sim.skills.facts import require
-from sim.skills.failures import SkillFailure
+from sim.skills.failures import SkillFailure, require
 from sim.skills.grasps import Grasp
 from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, grip, plan_pick, retreat, stow
 from sim.skills.plan_cache import cached_plan
@@ -31,7 +30,7 @@ def assess_hold(body: Body, action: Action) -> tuple[Grasp | None, Reach]:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    require(body, action)
+    require(body.world, action)
     obj = body.obj(action.object_id)
     return plan_pick(body, action.arm, obj) if obj.movable else (None, plan_handle(body, action.arm, obj))
 
@@ -77,7 +76,7 @@ def release(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     del outcome_draw
     arm = action.arm
     assert arm is not None
-    require(body, action)
+    require(body.world, action)
     obj = body.obj(body.hands.lifted or body.hands.held[arm] or "")
     name = obj.object_id
     body.world.grasps.detach(arm.value)

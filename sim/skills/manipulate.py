@@ -23,8 +23,7 @@ from interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
 from sim.skills.body.ready import carrying_posture, ready_posture
-from sim.skills.facts import require
-from sim.skills.failures import SkillFailure
+from sim.skills.failures import SkillFailure, require
 from sim.skills.grasps import Grasp, grasp_candidates
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach, diagnose, diagnosed, fulfils, plan_reach, route
@@ -423,7 +422,7 @@ def assess_pick(body: Body, action: Action) -> tuple[Grasp, Reach]:
         SkillFailure: as Pick would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    require(body, action)
+    require(body.world, action)
     obj = body.obj(action.object_id)
     return plan_pick(body, action.arm, obj)
 
@@ -436,7 +435,7 @@ def assess_place(body: Body, action: Action) -> tuple[Array, Reach, Array]:
         SkillFailure: as Place would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    require(body, action)
+    require(body.world, action)
     held = body.obj(body.hands.held[action.arm] or "")
     return plan_place(body, action.arm, held, body.obj(action.object_id))
 
@@ -449,7 +448,7 @@ def reset_arm(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """
     del outcome_draw
     assert action.arm is not None
-    require(body, action)
+    require(body.world, action)
     if body.hands.held[action.arm] is None:
         yield from body.hands.move(action.arm, 1.0)
     yield from stow(body, action.arm)

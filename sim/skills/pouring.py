@@ -17,16 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from interface.bodies import Arm
+from interface.facts import FULL_SHARE
 from interface.failures import FailureCode
 from interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
-from sim.skills.facts import FULL_SHARE, WorldFacts, require
-from sim.skills.failures import SkillFailure
+from sim.skills.failures import SkillFailure, require
 from sim.skills.manipulate import OutcomeDraw, plan_bring, shift_hand, stow
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
 from sim.skills.runner import CONTROL_DT_S, Skill, wait
+from sim.world.facts import world_facts
 from sim.world.liquids import STEEP, opening_radius_m
 
 __all__ = ["assess_fill", "assess_pour", "fill", "pour"]
@@ -62,7 +63,7 @@ def assess_pour(body: Body, action: Action) -> tuple[Reach, float]:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    require(body, action)
+    require(body.world, action)
     arm, target = action.arm, body.obj(action.object_id)
     vessel = body.obj(body.hands.held[arm] or "")
     top, radius = _opening(body, target)
@@ -166,7 +167,7 @@ def pour(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
 
 def _outlet(body: Body, object_id: str) -> ObjectInstance:
     """The tap or machine that a liquid comes out of there."""
-    return body.obj(WorldFacts(body).outlet(object_id) or "")
+    return body.obj(world_facts(body.world).objects[object_id].outlet or "")
 
 
 @cached_plan
@@ -177,7 +178,7 @@ def assess_fill(body: Body, action: Action) -> Reach:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    require(body, action)
+    require(body.world, action)
     vessel, outlet = body.obj(body.hands.held[action.arm] or ""), _outlet(body, action.object_id)
     point = body.world.liquids.spout(outlet)
     assert point is not None

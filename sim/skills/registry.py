@@ -11,11 +11,11 @@ from interface.failures import FailureCode
 from interface.steps import Action, PlanStep
 from sim.skills import articulate, holding, locomotion, manipulate, pouring, set_down, tools, two_arm
 from sim.skills.body.body import Body
-from sim.skills.facts import WorldFacts
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import OutcomeDraw
 from sim.skills.push_door import Push
 from sim.skills.runner import Skill, refuse
+from sim.world.facts import world_facts
 
 __all__ = ["BODY_SKILLS", "SKILLS", "ArmSkill", "assess_action", "excludes", "skills_for"]
 
@@ -80,7 +80,7 @@ def _skill(body: Body, action: Action, conflict: bool, known: frozenset[str], ou
         return refuse(FailureCode.OBJECT_NOT_KNOWN)
     if action.name in SKILLS:
         return SKILLS[action.name].run(body, action, outcome_draw)
-    refusal = first_refusal(action, WorldFacts(body))
+    refusal = first_refusal(action, world_facts(body.world))
     return BODY_SKILLS[action.name](body, action) if refusal is None else refuse(refusal.code)
 
 

@@ -25,8 +25,7 @@ from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
 from sim.skills.body.clearance import TOUCH_M
 from sim.skills.body.ik import BothGoal
-from sim.skills.facts import require
-from sim.skills.failures import SkillFailure
+from sim.skills.failures import SkillFailure, require
 from sim.skills.manipulate import OutcomeDraw, upright
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import diagnose
@@ -77,7 +76,7 @@ def assess_place_both(body: Body, action: Action) -> BothPlacement:
         SkillFailure: as PlaceBoth would before it moves.
     """
     assert action.object_id is not None
-    require(body, action)
+    require(body.world, action)
     receptacle, obj = body.obj(action.object_id), body.obj(body.hands.lifted or "")
     spots = body.workspace.free_spots(obj, receptacle, None)
     if not spots:

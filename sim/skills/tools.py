@@ -21,8 +21,7 @@ from interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.articulate import plan_press
 from sim.skills.body.body import Body
-from sim.skills.facts import require
-from sim.skills.failures import SkillFailure
+from sim.skills.failures import SkillFailure, require
 from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, plan_bring, shift_hand, stow
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
@@ -59,7 +58,7 @@ def assess_slice(body: Body, action: Action) -> Reach:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    require(body, action)
+    require(body.world, action)
     obj, tool = body.obj(action.object_id), body.obj(body.hands.held[action.arm] or "")
     names = (tool.object_id, obj.object_id, *body.world.containment.parents(obj.object_id)[:1])
     return plan_bring(body, action.arm, tool, [_top(body, obj)], names, point=_blade(tool), above_m=0.002)[1]
@@ -73,7 +72,7 @@ def assess_clean(body: Body, action: Action) -> Reach:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    require(body, action)
+    require(body.world, action)
     obj, tool = body.obj(action.object_id), body.obj(body.hands.held[action.arm] or "")
     spots = [np.asarray(puddle.position) for puddle in body.world.liquids.puddles if puddle.surface == obj.object_id]
     if not spots:
@@ -91,7 +90,7 @@ def assess_use_up(body: Body, action: Action) -> Reach:
         SkillFailure: as the skill would before it moves.
     """
     assert action.arm is not None and action.object_id is not None
-    require(body, action)
+    require(body.world, action)
     obj = body.obj(action.object_id)
     return plan_press(body, action.arm, _top(body, obj) - (0.0, 0.0, 0.01), (obj.object_id,))
 

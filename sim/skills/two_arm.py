@@ -21,8 +21,7 @@ from interface.steps import Action
 from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
 from sim.skills.body.ik import BothGoal
-from sim.skills.facts import require
-from sim.skills.failures import SkillFailure
+from sim.skills.failures import SkillFailure, require
 from sim.skills.grasps import solid_box
 from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw
 from sim.skills.plan_cache import cached_plan
@@ -100,7 +99,7 @@ def assess_lift(body: Body, action: Action) -> BothReach:
         SkillFailure: as Lift would before it moves.
     """
     assert action.object_id is not None
-    require(body, action)
+    require(body.world, action)
     obj = body.obj(action.object_id)
     sides = _sides(body, obj)
     name = (obj.object_id,)

@@ -1,17 +1,19 @@
 """Goal predicates over object states: what a task asks for, and how much of it holds.
 
-A goal is a small tree in plain JSON (`Predicate`). It is evaluated on the simulator's metadata only (`World.metadata()`:
-AI2-THOR state names), so a goal never depends on how it was reached. Paper: tasks and success of the DualTHOR benchmark;
+A goal is a small tree in plain JSON (`Predicate`). It is evaluated on the facts of a world alone, so it never depends on how it
+was reached. Paper: tasks and success of the DualTHOR benchmark;
 goal-condition success follows the usual definition (satisfied conditions over all conditions).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
-__all__ = ["ANY", "KINDS", "Predicate", "PredicateError", "goal_fraction", "goals_hold"]
+from interface.facts import ObjectFacts
+
+__all__ = ["ANY", "KINDS", "Predicate", "PredicateError"]
 
 Kind = Literal[
     "on", "in", "held", "lifted", "open", "closed", "toggled_on", "toggled_off", "filled", "sliced", "cooked", "clean",
@@ -43,17 +45,19 @@ KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     "exists": ("object_type", "of", "at_least"),
 }
 
-#: State that a leaf asks for, by kind: its name in the metadata and the value.
-_STATES: Final[Mapping[str, tuple[str, bool]]] = {
-    "open": ("isOpen", True),
-    "closed": ("isOpen", False),
-    "toggled_on": ("isToggled", True),
-    "toggled_off": ("isToggled", False),
-    "filled": ("isFilledWithLiquid", True),
-    "sliced": ("isSliced", True),
-    "cooked": ("isCooked", True),
-    "clean": ("isDirty", False),
-    "used_up": ("isUsedUp", True),
+#: What a leaf about one object asks for, by kind.
+_STATES: Final[Mapping[str, Callable[[ObjectFacts], bool]]] = {
+    "held": lambda item: item.picked_up,
+    "lifted": lambda item: len(item.holders) == 2 and not item.carriers,
+    "open": lambda item: item.open,
+    "closed": lambda item: not item.open,
+    "toggled_on": lambda item: item.on is True,
+    "toggled_off": lambda item: item.on is False,
+    "filled": lambda item: item.filled,
+    "sliced": lambda item: item.sliced,
+    "cooked": lambda item: item.cooked,
+    "clean": lambda item: not item.dirty,
+    "used_up": lambda item: item.used_up,
 }
 
 
@@ -132,17 +136,14 @@ class Predicate:
         )
         return tuple(self.of[0].about(name) for name in names)
 
-    def holds(self, metadata: Mapping[str, Any]) -> bool:
-        """Whether the predicate is true in `World.metadata()`.
+    def holds(self, objects: Mapping[str, ObjectFacts]) -> bool:
+        """Whether the predicate is true of a world's objects.
 
         Raises:
-            PredicateError: when it names an object that the metadata does not list.
+            PredicateError: when it names an object that is not among them.
         """
-        return self._holds({entry["objectId"]: entry for entry in metadata["objects"]})
-
-    def _holds(self, objects: Mapping[str, Mapping[str, Any]]) -> bool:
         if self.kind in ("and", "or", "not", "count"):
-            values = [operand._holds(objects) for operand in self.of]
+            values = [operand.holds(objects) for operand in self.of]
             if self.kind == "and":
                 return all(values)
             if self.kind == "or":
@@ -151,20 +152,15 @@ class Predicate:
                 return not values[0]
             return sum(values) >= self.at_least
         if self.kind == "exists":
-            return sum(operand._holds(objects) for operand in self.candidates(objects)) >= self.at_least
-        entry = objects.get(self.object_id)
-        if entry is None:
+            return sum(operand.holds(objects) for operand in self.candidates(objects)) >= self.at_least
+        if self.object_id not in objects:
             raise PredicateError(f"{self.kind}: no object {self.object_id!r} in the scene; it has {', '.join(sorted(objects))}")
-        if self.kind in ("on", "in"):
-            if self.receptacle_id not in objects:
-                raise PredicateError(f"{self.kind}: no receptacle {self.receptacle_id!r} in the scene")
-            return not entry["isPickedUp"] and self.receptacle_id in (entry["parentReceptacles"] or ())
-        if self.kind == "held":
-            return bool(entry["isPickedUp"])
-        if self.kind == "lifted":
-            return len(entry["heldBy"]) == 2 and not entry["parentReceptacles"]
-        name, value = _STATES[self.kind]
-        return bool(entry[name]) == value
+        item = objects[self.object_id]
+        if self.kind not in ("on", "in"):
+            return _STATES[self.kind](item)
+        if self.receptacle_id not in objects:
+            raise PredicateError(f"{self.kind}: no receptacle {self.receptacle_id!r} in the scene")
+        return not item.picked_up and self.receptacle_id in item.carriers
 
     def to_text(self) -> str:
         """For people: `on(Mug_1, Table_1)`, `and(open(Fridge_1), held(Mug_1))`, `count(…, at_least=2)`."""
@@ -184,19 +180,3 @@ class Predicate:
             value = getattr(self, name)
             record[name] = [operand.to_json() for operand in value] if name == "of" else value
         return record
-
-
-def goals_hold(goals: Sequence[Predicate], metadata: Mapping[str, Any]) -> bool:
-    """Whether every goal holds."""
-    return all(_evaluate(goals, metadata))
-
-
-def goal_fraction(goals: Sequence[Predicate], metadata: Mapping[str, Any]) -> float:
-    """Goal-condition success: satisfied goals over all goals, in [0, 1]."""
-    values = _evaluate(goals, metadata)
-    return sum(values) / len(values)
-
-
-def _evaluate(goals: Iterable[Predicate], metadata: Mapping[str, Any]) -> list[bool]:
-    objects = {entry["objectId"]: entry for entry in metadata["objects"]}
-    return [goal._holds(objects) for goal in goals]

@@ -283,12 +283,12 @@ def _spots(empty: World, draft: Draft, rng: np.random.Generator) -> dict[str, ND
         if kind.name in BIG_TYPES:
             narrow *= OVERHANG_SHARE
         band = narrow + 0.06 if kind.name in BIG_TYPES else max(_EDGE_BAND_M, narrow + 0.05)
-        obj = empty.object(carrier)
-        was_open, obj.openness = obj.openness, 1.0
         other = draft.beside.get(name)
         anchor = None if other is None else spots[other][:2] if other in spots else empty.poses.pose(other)[:2, 3]
         for _ in range(12):
-            spot = empty.containment.free_spot(carrier, narrow, height_m=kind.size[2], rng=rng, band_m=band, gap_m=0.04)
+            spot = empty.containment.free_spot(
+                carrier, narrow, height_m=kind.size[2], rng=rng, band_m=band, gap_m=0.04, through_doors=True
+            )
             if spot is None or any(
                 there == carrier and float(np.linalg.norm(spot[:2] - place)) <= radius + size + _HAND_GAP_M
                 for place, size, there in taken
@@ -299,7 +299,6 @@ def _spots(empty: World, draft: Draft, rng: np.random.Generator) -> dict[str, ND
                 spots[name], spots_gap = spot, gap
             if anchor is None:
                 break
-        obj.openness = was_open
         if name in spots:
             taken.append((spots[name][:2], radius, carrier))
         if name not in spots:

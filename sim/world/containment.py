@@ -58,11 +58,12 @@ class Containment:
         gap_m: float = 0.03,
         ignore: Iterable[str] = (),
         band_m: float = REACH_BAND_M,
+        through_doors: bool = False,
     ) -> NDArray[np.float64] | None:
         """A (3,) world point where an object can be put, None when there is no room; see `find_free_spot`."""
         return find_free_spot(
             self._scene.data, self._scene.objects, self._scene.object(receptacle_id), footprint_radius_m,
-            height_m=height_m, near=near, rng=rng, gap_m=gap_m, ignore=ignore, band_m=band_m,
+            height_m=height_m, near=near, rng=rng, gap_m=gap_m, ignore=ignore, band_m=band_m, through_doors=through_doors,
         )  # fmt: skip
 
     def total_mass_kg(self, object_id: str) -> float:

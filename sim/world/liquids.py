@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from interface.facts import FILLED_SHARE
 from sim.scene.compiler import PUDDLES
 from sim.scene.objects import ObjectInstance
 from sim.world.appearance import Appearance
@@ -27,7 +28,6 @@ from sim.world.scene_state import SceneState
 __all__ = ["LIQUIDS", "STEEP", "LiquidLedger", "Puddle", "opening_radius_m"]
 
 LIQUIDS: Final = ("water", "coffee", "wine")
-FILLED_SHARE: Final = 0.1
 TAP_L_S: Final = 0.15
 COFFEE_L_S: Final = 0.05
 POUR_L_S: Final = 0.25

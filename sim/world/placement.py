@@ -71,13 +71,14 @@ def find_free_spot(
     gap_m: float = 0.03,
     ignore: Iterable[str] = (),
     band_m: float = REACH_BAND_M,
+    through_doors: bool = False,
 ) -> NDArray[np.float64] | None:
     """A point on a receptacle's surfaces where an object of that footprint can be put.
 
     Args:
         data: current poses.
         objects: everything in the scene; obstacles are all objects but the receptacle and `ignore`.
-        receptacle: where to put it; surfaces behind a closed door are skipped.
+        receptacle: where to put it; surfaces behind a closed door are skipped, unless `through_doors`.
         radius_m: radius of the footprint.
         height_m: height of the object, must fit below the surface's clearance.
         near: (2,) or (3,) world point; the nearest free spot is taken. Without it, `rng` draws one; without both, the spot
@@ -86,6 +87,7 @@ def find_free_spot(
         gap_m: free distance to other objects.
         ignore: ids that do not block (the object itself).
         band_m: how far from the reachable edge a spot may be.
+        through_doors: whether closed doors do not matter, as at the start of an episode.
 
     Returns:
         (3,) world point on the surface, or None when there is no room.
@@ -96,9 +98,9 @@ def find_free_spot(
     found: list[NDArray[np.float64]] = []
     for surface in receptacle.surfaces:
         spec = surface.spec
-        if (spec.inside and not receptacle.is_open) or height_m > spec.clearance + (0.3 if _is_hollow(receptacle) else 10.0):
+        if spec.inside and (height_m > spec.clearance or not (receptacle.is_open or through_doors)):
             continue
-        if spec.inside and height_m > spec.clearance:
+        if height_m > spec.clearance + (0.3 if _is_hollow(receptacle) else 10.0):
             continue
         points = _candidates(receptacle, surface, radius_m, band_m)
         if not len(points):

@@ -182,8 +182,6 @@ class World:
         ]
         if carrier.object_id in pending:
             raise WorldError(f"{placement.object_id} is placed on {carrier.object_id} before that has its own place")
-        was_open = carrier.openness
-        carrier.openness = 1.0  # a start in a closed cabinet is allowed; only hands need the door open
         target = None if placement.xy is None else np.asarray(placement.xy, dtype=float)
         spot: NDArray[np.float64] | None = None
         # An explicit place only has to carry the object: it may stand a little over the edge.
@@ -198,10 +196,10 @@ class World:
                 gap_m=gap,
                 ignore=(item.object_id, *pending),
                 band_m=10.0 if target is not None else REACH_BAND_M,
+                through_doors=True,
             )
             if spot is not None:
                 break
-        carrier.openness = was_open
         if spot is None:
             raise WorldError(f"no room for {placement.object_id} on {placement.receptacle} in {self.room.name}")
         if target is not None:

@@ -68,7 +68,7 @@ from interface.failures import FailureCode
 from interface.steps import Action
 from sim.skills.articulate import plan_press
 from sim.skills.body.body import Body
-from sim.skills.facts import require
+from sim.skills.failures import require
 from sim.skills.failures import SkillFailure
 from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw, stow
 from sim.skills.reach import Reach
@@ -78,7 +78,7 @@ from sim.skills.runner import Skill
 def assess_tap(body: Body, action: Action) -> Reach:
     """What Tap would do."""
     assert action.arm is not None and action.object_id is not None
-    require(body, action)
+    require(body.world, action)
     low, high = body.world.poses.bounds(action.object_id)
     top = np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, high[2] - 0.01])
     return plan_press(body, action.arm, top, (action.object_id,))

@@ -2,94 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import fields, replace
 
 import pytest
 
 from interface.actions import ACTIONS, ActionKind, bringing_about, exclude_each_other, first_refusal
 from interface.bodies import Arm
 from interface.effects import Condition
+from interface.facts import Affordances, Facts, ObjectFacts
 from interface.failures import FAILURES, FailureCode
 from interface.observation import HistoryItem
 from interface.steps import Action
 from interface.symbolic import SymbolicState, events_of
 
 
-@dataclass
-class Item:
-    """An object with every fact spelled out."""
-
-    object_id: str
-    movable: bool = True
-    pickupable: bool = True
-    two_handed: bool = False
-    liftable: bool = False
-    receptacle: bool = False
-    openable: bool = False
-    toggleable: bool = False
-    sliceable: bool = False
-    consumable: bool = False
-    fillable: bool = False
-    cutter: bool = False
-    wiper: bool = False
-    unsteady: bool = False
-    holders: tuple[str, ...] = ()
-    opened: bool = False
-    closed: bool = False
-    shut: bool = False
-    covered: bool = False
-    on: bool = False
-    sliced: bool = False
-    soiled: bool = False
-    used_up: bool = False
-    broken: bool = False
-    filled: bool = False
-    full: bool = False
+def can(*what: str) -> Affordances:
+    """Nothing but this."""
+    return Affordances(**{field.name: field.name in what for field in fields(Affordances)})
 
 
-@dataclass
-class Small:
+def world(
+    hands: dict[Arm, str] | None = None,
+    lifted: str | None = None,
+    inside: dict[str, str] | None = None,
+    mass_kg: float = 0.5,
+    **states: dict[str, object],
+) -> Facts:
     """A world of a few objects."""
-
-    items: dict[str, Item]
-    hands: dict[Arm, str] = field(default_factory=dict)
-    lifted: str | None = None
-    inside: dict[str, str] = field(default_factory=dict)
-    overload: float = -1.0
-
-    def held(self, arm: Arm) -> str | None:
-        return self.hands.get(arm)
-
-    def object(self, object_id: str) -> Item:
-        return self.items[object_id]
-
-    def carriers(self, object_id: str) -> Iterable[str]:
-        return [self.inside[object_id]] if object_id in self.inside else []
-
-    def overload_kg(self, object_id: str, arms: int) -> float:
-        return self.overload
-
-    def outlet(self, object_id: str) -> str | None:
-        return "Faucet_1" if object_id in ("Faucet_1", "Sink_1") else None
-
-
-def world(**changes: object) -> Small:
+    small, fixed = ("movable", "pickupable"), ("receptacle",)
     items = {
-        "Mug_1": Item("Mug_1", fillable=True),
-        "Jug_1": Item("Jug_1", fillable=True, filled=True),
-        "Bread_1": Item("Bread_1", sliceable=True, unsteady=True),
-        "Knife_1": Item("Knife_1", cutter=True),
-        "Fridge_1": Item("Fridge_1", movable=False, pickupable=False, receptacle=True, openable=True, shut=True, closed=True),
-        "Table_1": Item("Table_1", movable=False, pickupable=False, receptacle=True),
-        "Box_1": Item("Box_1", pickupable=False, two_handed=True, liftable=True),
-        "Faucet_1": Item("Faucet_1", movable=False, pickupable=False, toggleable=True),
-        "Sink_1": Item("Sink_1", movable=False, pickupable=False, receptacle=True),
-    }
-    return Small(items, **changes)  # type: ignore[arg-type]
+        "Mug_1": can(*small, "fillable"), "Jug_1": can(*small, "fillable"), "Bread_1": can(*small, "sliceable", "unsteady"),
+        "Knife_1": can(*small, "cutter"), "Box_1": can("movable", "liftable"), "Fridge_1": can(*fixed, "openable", "encloses"),
+        "Table_1": can(*fixed), "Sink_1": can(*fixed), "Faucet_1": can("toggleable"),
+    }  # fmt: skip
+    known: dict[str, dict[str, object]] = {
+        "Jug_1": {"fill": 1.0}, "Box_1": {"two_handed": True}, "Faucet_1": {"outlet": "Faucet_1"},
+        "Sink_1": {"outlet": "Faucet_1"},
+    }  # fmt: skip
+    places = {name: (place,) for name, place in (inside or {}).items()}
+    objects = {
+        name: ObjectFacts(
+            name, affordances, mass_kg=mass_kg, carriers=places.get(name, ()), **known.get(name, {}) | states.get(name, {})  # type: ignore[arg-type]
+        )
+        for name, affordances in items.items()
+    }  # fmt: skip
+    return Facts(objects, dict.fromkeys(Arm) | (hands or {}), lifted, (1.0, 2.0))
 
 
-def code(text: str, facts: Small) -> str:
+def code(text: str, facts: Facts) -> str:
     refusal = first_refusal(Action.parse(text), facts)
     return "" if refusal is None else refusal.code
 
@@ -105,7 +65,7 @@ LEFT_MUG = {Arm.LEFT: "Mug_1"}
         ("Pick(left, Mug_1)", world(lifted="Box_1", hands=LEFT_MUG), "BothHandsBusy"),  # before the hand itself
         ("Pick(left, Table_1)", world(), "NotPickupable"),
         ("Pick(left, Box_1)", world(), "NeedsTwoHands"),
-        ("Pick(left, Box_1)", world(overload=2.0), "TooHeavy"),  # before the number of hands
+        ("Pick(left, Box_1)", world(mass_kg=4.0), "TooHeavy"),  # before the number of hands
         ("Pick(left, Mug_1)", world(inside={"Mug_1": "Fridge_1"}), "ReceptacleClosed"),
         ("Place(left, Table_1)", world(), "HandEmpty"),
         ("Place(left, Fridge_1)", world(hands=LEFT_MUG), "ReceptacleClosed"),
@@ -132,21 +92,32 @@ LEFT_MUG = {Arm.LEFT: "Mug_1"}
         ("ResetArm(left)", world(hands={Arm.LEFT: "Fridge_1"}), "InUse"),
     ],
 )
-def test_the_first_requirement_that_fails_decides(text: str, facts: Small, expected: str) -> None:
+def test_the_first_requirement_that_fails_decides(text: str, facts: Facts, expected: str) -> None:
     assert code(text, facts) == expected
     assert not expected or FailureCode(expected) in Action.parse(text).spec.codes
 
 
 def test_what_is_steadied_can_be_cut_where_it_rests() -> None:
-    facts = world(hands={Arm.LEFT: "Knife_1", Arm.RIGHT: "Bread_1"}, inside={"Bread_1": "Table_1"})
-    facts.items["Bread_1"].holders = ("right",)
-    assert code("Slice(left, Bread_1)", facts) == ""
-    facts.inside.clear()  # in the air
-    assert code("Slice(left, Bread_1)", facts) == "NeedsSteadying"
+    hands = {Arm.LEFT: "Knife_1", Arm.RIGHT: "Bread_1"}
+    held = {"Bread_1": {"holders": ("right",)}}
+    assert code("Slice(left, Bread_1)", world(hands, inside={"Bread_1": "Table_1"}, **held)) == ""
+    assert code("Slice(left, Bread_1)", world(hands, **held)) == "NeedsSteadying"  # in the air
+
+
+def test_shares_decide_what_is_open_filled_and_full() -> None:
+    door = ObjectFacts("Fridge_1", can("openable", "encloses"))
+    states = {share: replace(door, openness=share) for share in (0.0, 0.05, 0.2, 0.34, 0.5, 0.61, 1.0)}
+    assert [share for share, one in states.items() if one.closed] == [0.0, 0.05]
+    assert [share for share, one in states.items() if one.opened] == [0.61, 1.0]
+    assert [share for share, one in states.items() if one.open] == [share for share, one in states.items() if not one.shut]
+    assert [share for share, one in states.items() if one.shut] == [0.0, 0.05, 0.2]
+    assert not replace(door, can=can()).open and not replace(door, can=can()).shut
+    levels = [replace(door, fill=share) for share in (0.0, 0.09, 0.1, 0.9, 0.999, 1.0)]
+    assert [(one.filled, one.full) for one in levels] == [(False, False)] * 2 + [(True, False)] * 2 + [(True, True)] * 2
 
 
 def test_margins_come_with_weight() -> None:
-    refusal = first_refusal(Action.parse("Pick(left, Box_1)"), world(overload=1.5))
+    refusal = first_refusal(Action.parse("Pick(left, Box_1)"), world(mass_kg=3.5))
     assert refusal is not None and dict(refusal.margins) == {"mass_kg": 1.5}
 
 

@@ -18,6 +18,7 @@ import yaml
 
 from configs.assets import own_files
 from configs.validate import ConfigError, build
+from interface.facts import Affordances
 
 __all__ = [
     "CATALOGUE_PATH",
@@ -294,6 +295,31 @@ class ObjectType:
     def fillable(self) -> bool:
         """Whether it can hold a liquid."""
         return "fillable" in self.properties
+
+    @property
+    def spouts(self) -> bool:
+        """Whether a liquid comes out of it."""
+        return any("spout" in part.options for part in self.parts)
+
+    def affordances(self, movable: bool) -> Affordances:
+        """What can be done with an object of the type, one that can be carried or one that belongs to the room."""
+        return Affordances(
+            movable=movable,
+            pickupable=self.pickupable,
+            liftable=self.broad,
+            receptacle=self.receptacle,
+            openable=self.openable,
+            encloses=self.encloses,
+            lidded=self.lidded,
+            toggleable=self.toggleable,
+            sliceable=self.has("sliceable"),
+            consumable=self.has("used_up"),
+            fillable=self.fillable,
+            cutter=self.has("cutter"),
+            wiper=self.has("wiper"),
+            unsteady=self.has("unsteady"),
+            heat_source=self.has("heat_source"),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

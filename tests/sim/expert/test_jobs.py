@@ -3,7 +3,8 @@
 import pytest
 
 from interface.bodies import Arm
-from sim.expert.jobs import Facts, Job, pending_leaves, plan_jobs
+from interface.facts import Affordances, Facts, ObjectFacts
+from sim.expert.jobs import Job, Setting, pending_leaves, plan_jobs
 from sim.tasks.predicates import Predicate
 
 LEFT, RIGHT = Arm.LEFT, Arm.RIGHT
@@ -15,18 +16,17 @@ def facts(held=None, lifted=None, fridge_open=False, places=None, lamp=False):
     objects = {}
     for name in ("Counter_1", "Table_1", "Fridge_1", "Lamp_1", *places):
         in_hands = [arm.value for arm, item in hands.items() if item == name] + (["left", "right"] if lifted == name else [])
-        objects[name] = {
-            "objectId": name,
-            "parentReceptacles": [places[name]] if name in places and not in_hands else [],
-            "isPickedUp": bool(in_hands),
-            "heldBy": in_hands,
-            "pickupable": name in places,
-            "moveable": False,
-            "openable": name == "Fridge_1",
-            "isOpen": name == "Fridge_1" and fridge_open,
-            "isToggled": name == "Lamp_1" and lamp,
-        }
-    return Facts(objects, hands, lifted, frozenset({"Box_1"}), places)
+        fridge = name == "Fridge_1"
+        objects[name] = ObjectFacts(
+            name,
+            Affordances(movable=name in places, pickupable=name in places, openable=fridge, encloses=fridge),
+            holders=in_hands,
+            carriers=(places[name],) if name in places and not in_hands else (),
+            two_handed=name == "Box_1",
+            openness=float(fridge and fridge_open),
+            on=name == "Lamp_1" and lamp,
+        )
+    return Setting(Facts(objects, hands, lifted), places)
 
 
 ON_TABLE = Predicate("on", "Mug_1", "Table_1")
@@ -98,30 +98,25 @@ def kitchen(held=None, arms=(RIGHT, LEFT), **states):
     objects = {}
     for name in ("Counter_1", "Faucet_1", "Microwave_1", "Drawer_1", "Cabinet_1", *places):
         in_hands = [arm.value for arm, item in hands.items() if item == name]
-        objects[name] = {
-            "objectId": name,
-            "parentReceptacles": [places[name]] if name in places and not in_hands else [],
-            "isPickedUp": bool(in_hands),
-            "heldBy": in_hands,
-            "pickupable": name in places,
-            "moveable": False,
-            "openable": name in ("Microwave_1", "Drawer_1", "Cabinet_1"),
-            "selfClosing": name == "Drawer_1",
-            "isHeatSource": name == "Microwave_1",
-        } | dict.fromkeys(
-            ("isOpen", "isToggled", "isFilledWithLiquid", "isSliced", "isCooked", "isDirty", "isUsedUp"), False
-        ) | states.get(name, {})  # fmt: skip
-    tools = {"cutter": ("Knife_1",), "wiper": ("Sponge_1",)}
-    unsteady, switches = frozenset({"Apple_1", "Plate_1"}), {"Sink_1": "Faucet_1"}
-    return Facts(objects, hands, None, frozenset(), places, frozenset(), tools, unsteady, ("Faucet_1",), switches, arms)
+        doors, movable = name in ("Microwave_1", "Drawer_1", "Cabinet_1"), name in places
+        can = Affordances(
+            movable=movable, pickupable=movable, openable=doors, encloses=doors, cutter=name == "Knife_1",
+            wiper=name == "Sponge_1", unsteady=name in ("Apple_1", "Plate_1"), heat_source=name == "Microwave_1",
+            toggleable=name in ("Microwave_1", "Faucet_1"),
+        )  # fmt: skip
+        carriers = (places[name],) if movable and not in_hands else ()
+        outlet = name if name == "Faucet_1" else None
+        known = {"self_closing": name == "Drawer_1", "carriers": carriers, "switch": name, "outlet": outlet}
+        objects[name] = ObjectFacts(name, can, tuple(in_hands), **known | states.get(name, {}))
+    return Setting(Facts(objects, hands), places, arms)
 
 
 SLICED, CLEAN, FILLED = Predicate("sliced", "Apple_1"), Predicate("clean", "Plate_1"), Predicate("filled", "Mug_1")
 STORED = [Predicate("in", "Mug_1", "Drawer_1"), Predicate("closed", "Drawer_1")]
 FETCHED = [Predicate("held", "Egg_1"), Predicate("closed", "Drawer_1")]
-COOKED, INSIDE = Predicate("cooked", "Egg_1"), {"parentReceptacles": ["Microwave_1"]}
-DIRTY = {"Plate_1": {"isDirty": True}}
-OPEN = {"Drawer_1": {"isOpen": True}}
+COOKED, INSIDE = Predicate("cooked", "Egg_1"), {"carriers": ("Microwave_1",)}
+DIRTY = {"Plate_1": {"dirty": True}}
+OPEN = {"Drawer_1": {"openness": 1.0}}
 WORK = Job("Slice", "Apple_1", RIGHT)
 
 
@@ -135,16 +130,16 @@ WORK = Job("Slice", "Apple_1", RIGHT)
         ([CLEAN], kitchen({LEFT: "Sponge_1"}, **DIRTY), [Job("Hold", "Plate_1", RIGHT, Job("Clean", "Plate_1", LEFT))]),
         ([FILLED], kitchen(), [Job("Pick", "Mug_1")]),
         ([FILLED], kitchen({LEFT: "Mug_1"}), [Job("ToggleOn", "Faucet_1")]),
-        ([FILLED], kitchen({LEFT: "Mug_1"}, Faucet_1={"isToggled": True}), [Job("Fill", "Faucet_1", LEFT)]),
-        ([FILLED], kitchen(Jug_1={"isFilledWithLiquid": True}), [Job("Pick", "Jug_1")]),
-        ([FILLED], kitchen({LEFT: "Jug_1"}, Jug_1={"isFilledWithLiquid": True}), [Job("Pour", "Mug_1", LEFT)]),
+        ([FILLED], kitchen({LEFT: "Mug_1"}, Faucet_1={"on": True}), [Job("Fill", "Faucet_1", LEFT)]),
+        ([FILLED], kitchen(Jug_1={"fill": 1.0}), [Job("Pick", "Jug_1")]),
+        ([FILLED], kitchen({LEFT: "Jug_1"}, Jug_1={"fill": 1.0}), [Job("Pour", "Mug_1", LEFT)]),
         ([Predicate("used_up", "Jug_1")], kitchen(), [Job("UseUp", "Jug_1")]),
-        ([COOKED], kitchen(Egg_1=INSIDE, Microwave_1={"isOpen": True}), [Job("Close", "Microwave_1")]),
+        ([COOKED], kitchen(Egg_1=INSIDE, Microwave_1={"openness": 1.0}), [Job("Close", "Microwave_1")]),
         ([COOKED], kitchen(Egg_1=INSIDE), [Job("ToggleOn", "Microwave_1")]),
-        ([COOKED], kitchen(Egg_1=INSIDE, Microwave_1={"isToggled": True}), [Job("ResetArm", "", RIGHT)]),
+        ([COOKED], kitchen(Egg_1=INSIDE, Microwave_1={"on": True}), [Job("ResetArm", "", RIGHT)]),
         (STORED, kitchen({RIGHT: "Mug_1"}), [Job("Open", "Drawer_1", then=Job("Place", "Drawer_1", RIGHT))]),
         (STORED, kitchen({RIGHT: "Mug_1", LEFT: "Drawer_1"}, **OPEN), [Job("Place", "Drawer_1", RIGHT)]),
-        (STORED, kitchen({LEFT: "Drawer_1"}, Mug_1={"parentReceptacles": ["Drawer_1"]}, **OPEN), [Job("Release", "", LEFT)]),
+        (STORED, kitchen({LEFT: "Drawer_1"}, Mug_1={"carriers": ("Drawer_1",)}, **OPEN), [Job("Release", "", LEFT)]),
         (FETCHED, kitchen(), [Job("Open", "Drawer_1", then=Job("Pick", "Egg_1"))]),
         (FETCHED, kitchen({LEFT: "Drawer_1"}, **OPEN), [Job("Pick", "Egg_1")]),
         (FETCHED, kitchen({LEFT: "Drawer_1", RIGHT: "Egg_1"}, **OPEN), [Job("Release", "", LEFT)]),
@@ -152,7 +147,7 @@ WORK = Job("Slice", "Apple_1", RIGHT)
         ([Predicate("in", "Mug_1", "Cabinet_1")], kitchen(arms=(RIGHT,)), [Job("Open", "Cabinet_1")]),
         ([Predicate("in", "Mug_1", "Cabinet_1"), Predicate("in", "Jug_1", "Cabinet_1")], kitchen(), [Job("Open", "Cabinet_1")]),
         # what was only held where it is is let go of, what was picked up is put back
-        ([Predicate("held", "Mug_1")], kitchen({LEFT: "Apple_1"}, Apple_1={"parentReceptacles": ["Counter_1"]}),
+        ([Predicate("held", "Mug_1")], kitchen({LEFT: "Apple_1"}, Apple_1={"carriers": ("Counter_1",)}),
          [Job("Release", "", LEFT)]),
         ([Predicate("held", "Mug_1")], kitchen({LEFT: "Apple_1"}), [Job("Place", "Counter_1", LEFT)]),
     ],

@@ -10,11 +10,11 @@ import pytest
 
 from interface.steps import PlanStep
 from robots.spec import load_robot
+from sim.interfaces.metadata import world_metadata
 from sim.scene.catalogue import load_catalogue
 from sim.scene.compiler import build_type_spec
 from sim.scene.objects import ObjectPlacement, index_object
 from sim.session.session import FreePlay, Session
-from sim.world.metadata import world_metadata
 from sim.world.world import World
 
 LIDDED = ("Box", "Book", "Kettle", "Laptop", "Toilet", "LaundryHamper")

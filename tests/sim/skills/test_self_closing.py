@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from interface.steps import Action, PlanStep
+from sim.interfaces.metadata import world_metadata
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
-from sim.world.metadata import world_metadata
 from sim.world.world import World, WorldError
 
 DOORS = ("Fridge_1", "Cabinet_1", "Drawer_1", "Microwave_1")

@@ -6,6 +6,7 @@ import pytest
 from interface.bodies import Arm
 from interface.failures import FailureCategory, FailureCode
 from interface.steps import Action, PlanStep
+from sim.interfaces.metadata import world_metadata
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
 from sim.skills.articulate import assess_open_close
@@ -17,7 +18,6 @@ from sim.skills.plan_cache import cached_plan
 from sim.skills.push_door import Push
 from sim.skills.runner import refuse, run_skills
 from sim.skills.set_down import assess_place_both
-from sim.world.metadata import world_metadata
 from sim.world.world import World
 
 THINGS = (
@@ -176,7 +176,7 @@ def test_postures_from_an_assumed_stance_are_those_from_there(session):
 def test_a_switch_is_pressed(session):
     start(session)
     assert reach(session, "ToggleOn(left, StoveKnob_1)").success
-    assert session.world.objects["StoveKnob_1"].is_toggled and session.world.objects["StoveBurner_1"].is_toggled
+    assert session.world.objects["StoveKnob_1"].state.isToggled and session.world.objects["StoveBurner_1"].state.isToggled
     assert act(session, "ToggleOn(left, StoveKnob_1)")[0].code == "AlreadyInState"
 
 
@@ -185,7 +185,7 @@ def test_a_switch_is_pressed(session):
 )
 def test_a_tap_beside_its_basin_fills_a_mug(session, room, counter):
     start(session, FreePlay(room, placements=(ObjectPlacement("Mug_1", *counter),)))
-    assert reach(session, "ToggleOn(left, Faucet_1)").success and session.world.objects["Faucet_1"].is_toggled
+    assert reach(session, "ToggleOn(left, Faucet_1)").success and session.world.objects["Faucet_1"].state.isToggled
     arm = {"x1": "left", "h1": "right"}[session.robot.name]
     assert reach(session, f"Pick({arm}, Mug_1)").success
     assert reach(session, f"Fill({arm}, Faucet_1)").success
@@ -302,7 +302,7 @@ def test_bad_luck_is_acted_out():
     made.draw = lambda action: "broken"  # type: ignore[method-assign]
     outcome = reach(made, "Pick(right, Mug_1)")
     assert (outcome.code, outcome.contingency) == ("Broke", "broken")
-    assert made.world.objects["Mug_1"].is_broken and made.body.hands.held[Arm.RIGHT] is None
+    assert made.world.objects["Mug_1"].state.isBroken and made.body.hands.held[Arm.RIGHT] is None
     made.close()
 
 

@@ -1,29 +1,26 @@
-"""Goal predicates: every kind in both truth values, nesting, fractions, and what is refused."""
+"""Goal predicates: every kind in both truth values, nesting, and what is refused."""
 
 import pytest
 
-from sim.tasks.predicates import ANY, Predicate, PredicateError, goal_fraction, goals_hold
+from interface.facts import Affordances, ObjectFacts
+from sim.tasks.predicates import ANY, Predicate, PredicateError
 from sim.tasks.task import load_benchmark
 
-
-def entry(object_id, on=(), held=(), **state):
-    record = {"objectId": object_id, "parentReceptacles": list(on), "isPickedUp": bool(held), "heldBy": list(held)}
-    states = ("isOpen", "isToggled", "isFilledWithLiquid", "isSliced", "isCooked", "isDirty", "isUsedUp")
-    return record | dict.fromkeys(states, False) | state
-
-
-METADATA = {
-    "objects": [
-        entry("Mug_1", on=["Table_1"]),
-        entry("Apple_1", held=["left"]),
-        entry("Box_1", held=["left", "right"]),
-        entry("Fridge_1", isOpen=True),
-        entry("Lamp_1", isToggled=True),
-        entry("Table_1"),
-        entry("Mug_2", on=["Table_1"], isFilledWithLiquid=True, isDirty=True),
-        entry("Potato_1", on=["Fridge_1"], isSliced=True, isCooked=True),
-        entry("Soap_1", isUsedUp=True),
-    ]
+FURNITURE = Affordances(movable=False)
+OBJECTS = {
+    item.object_id: item
+    for item in (
+        ObjectFacts("Mug_1", Affordances(), carriers=("Table_1",), fill=0.09),
+        ObjectFacts("Apple_1", Affordances(), holders=("left",)),
+        ObjectFacts("Box_1", Affordances(), holders=("left", "right")),
+        ObjectFacts("Fridge_1", FURNITURE, openness=0.4),
+        ObjectFacts("Cabinet_1", FURNITURE, openness=0.3, holders=("left",)),
+        ObjectFacts("Lamp_1", FURNITURE, on=True),
+        ObjectFacts("Table_1", Affordances(movable=False, openable=False)),
+        ObjectFacts("Mug_2", Affordances(), carriers=("Table_1",), fill=0.1, dirty=True),
+        ObjectFacts("Potato_1", Affordances(), carriers=("Fridge_1",), sliced=True, cooked=True, wet=True),
+        ObjectFacts("Soap_1", Affordances(), used_up=True),
+    )
 }
 ON_TABLE = Predicate("on", ANY, "Table_1")
 
@@ -40,6 +37,9 @@ ON_TABLE = Predicate("on", ANY, "Table_1")
         (Predicate("open", "Fridge_1"), True),
         (Predicate("closed", "Fridge_1"), False),
         (Predicate("closed", "Table_1"), True),
+        (Predicate("open", "Cabinet_1"), False),
+        (Predicate("held", "Cabinet_1"), False),
+        (Predicate("clean", "Potato_1"), True),
         (Predicate("toggled_on", "Lamp_1"), True),
         (Predicate("toggled_off", "Lamp_1"), False),
         (Predicate("filled", "Mug_2"), True),
@@ -67,19 +67,12 @@ ON_TABLE = Predicate("on", ANY, "Table_1")
     ],
 )
 def test_truth(predicate, expected):
-    assert predicate.holds(METADATA) is expected
+    assert predicate.holds(OBJECTS) is expected
 
 
 def test_a_held_object_is_on_nothing():
-    metadata = {"objects": [entry("Mug_1", on=["Table_1"], held=["left"]), entry("Table_1")]}
-    assert not Predicate("on", "Mug_1", "Table_1").holds(metadata)
-
-
-def test_fraction_counts_conditions():
-    goals = (Predicate("held", "Apple_1"), Predicate("held", "Mug_1"), Predicate("open", "Fridge_1"))
-    assert goal_fraction(goals, METADATA) == pytest.approx(2 / 3)
-    assert not goals_hold(goals, METADATA)
-    assert goals_hold(goals[::2], METADATA)
+    held = ObjectFacts("Mug_1", Affordances(), carriers=("Table_1",), holders=("left",))
+    assert not Predicate("on", "Mug_1", "Table_1").holds(OBJECTS | {"Mug_1": held})
 
 
 def test_json_has_only_the_arguments_of_the_kind():
@@ -109,7 +102,7 @@ def test_malformed_predicates_are_refused(arguments, message):
 @pytest.mark.parametrize("predicate", [Predicate("held", "Ghost_1"), Predicate("on", "Mug_1", "Ghost_1")])
 def test_unknown_objects_are_named(predicate):
     with pytest.raises(PredicateError, match="Ghost_1"):
-        predicate.holds(METADATA)
+        predicate.holds(OBJECTS)
 
 
 def test_an_exists_names_its_receptacle_and_involves_every_object_of_its_type():

@@ -8,7 +8,7 @@ from robots.spec import load_robot
 from sim.tasks.families import CATEGORIES
 from sim.tasks.sample import BENCHMARK_SEEDS, ROOMS, TRAIN_ROOMS, TRAIN_SEEDS, sample_task, scene_of, start_height_m
 from sim.tasks.task import Task
-from sim.world.metadata import world_metadata
+from sim.world.facts import world_facts
 from sim.world.world import World
 
 SEED = TRAIN_SEEDS.start
@@ -43,8 +43,8 @@ def test_tasks_vary(tasks):
 def test_goals_do_not_hold_at_the_start_and_objects_stand_where_the_task_says(tasks):
     for task in tasks[:6]:
         world = World(None, task.room, task.placements, states=task.states, seed=task.seed)
-        metadata = world_metadata(world)
-        assert not all(goal.holds(metadata) for goal in task.goals), task.id
+        objects = world_facts(world).objects
+        assert not all(goal.holds(objects) for goal in task.goals), task.id
         for placement in task.placements:
             assert placement.receptacle in world.containment.parents(placement.object_id), (task.id, placement)
             assert np.linalg.norm(world.poses.pose(placement.object_id)[:2, 3] - placement.xy) < 0.05

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from robots.spec import load_robot
+from sim.interfaces.metadata import world_metadata
 from sim.scene.objects import ObjectPlacement
-from sim.world.metadata import world_metadata
 from sim.world.world import World, WorldError
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from interface.bodies import SIDES
 from robots.spec import load_robot
+from sim.interfaces.metadata import world_metadata
 from sim.scene.objects import STATE_NAMES, ObjectPlacement
 from sim.scene.rooms import room_names
-from sim.world.metadata import world_metadata
 from sim.world.world import World, WorldError
 
 
@@ -236,7 +236,7 @@ def test_knob_heats_and_tap_fills_and_fridge_cools() -> None:
     )  # fmt: skip
     world.states.set_state("StoveKnob_1", "isToggled", True)
     world.states.set_state("Faucet_1", "isToggled", True)
-    assert world.object("StoveBurner_1").is_toggled
+    assert world.object("StoveBurner_1").state.isToggled
     world.advance(15.0)
     state = {entry["objectId"]: entry for entry in world_metadata(world)["objects"]}
     assert state["Potato_1"]["isCooked"] and state["Potato_1"]["temperature"] == "Hot"
@@ -250,8 +250,8 @@ def test_fall_breaks_what_is_breakable() -> None:
         adr = world.object(name).qpos_adr
         world.data.qpos[adr : adr + 3] = (x, 0.0, 1.2)
     world.advance(1.5)
-    assert world.object("Plate_1").is_broken
-    assert not world.object("Apple_1").is_broken
+    assert world.object("Plate_1").state.isBroken
+    assert not world.object("Apple_1").state.isBroken
 
 
 def test_metadata_has_ai2thor_names() -> None:
