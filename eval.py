@@ -42,7 +42,8 @@ def run(cfg: EvalConfig) -> int:
     from proprio_mllm.planners.chat.embedding import EmbeddingError
     from proprio_mllm.planners.protocol import WeightsError
     from proprio_mllm.report.experiments import assemble
-    from proprio_mllm.report.runs import load_run, write_report
+    from proprio_mllm.report.runs import write_report
+    from proprio_mllm.report.stored import load_run
 
     if cfg.sanity:
         from proprio_mllm.evaluation.sanity import sanity

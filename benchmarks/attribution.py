@@ -32,8 +32,6 @@ from proprio_mllm.report.statistics import wilson
 from proprio_mllm.report.summary import write_json
 from proprio_mllm.report.table import Table
 
-__all__ = ["Validation", "ValidationConfig", "main", "run_cells", "validate"]
-
 #: Share of episodes that must get the type of their cause, and how many episodes there must be with both robots.
 AGREEMENT: Final = 0.95
 EPISODES: Final = 60

@@ -27,8 +27,6 @@ from proprio_mllm.evaluation.seeds import episode_seed, stream
 from proprio_mllm.evaluation.sessions import open_session
 from sim.tasks.task import BENCHMARK_PATH, Task, load_benchmark
 
-__all__ = ["Cell", "CellRunner", "Scripted", "ScriptedResult", "cells", "drawn", "read_plans", "run_scripted"]
-
 #: Episodes per cause and robot; logical has twice as many causes as each of the others.
 _QUOTA: Final[Mapping[FailureCategory, int]] = {
     FailureCategory.NAVIGATION: 3,

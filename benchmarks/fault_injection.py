@@ -38,8 +38,6 @@ from sim.tasks.predicates import Predicate
 from sim.tasks.task import Task
 from sim.world.facts import world_facts
 
-__all__ = ["CAUSES", "LATE_SLIPS", "SLIPS", "Cause", "FaultyPlanner"]
-
 #: Farther from its object's outline than this, no arm of either robot reaches it.
 _OUT_OF_REACH_M: Final = 1.1
 #: Steps after which a planner that gives up says Done.

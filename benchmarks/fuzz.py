@@ -29,8 +29,6 @@ from sim.interfaces.aliases import ALIASES
 from sim.interfaces.controller import Controller, Event
 from sim.scene.rooms import room_names
 
-__all__ = ["FuzzConfig", "Tally", "calls", "check", "fuzz", "main"]
-
 _LOG = logging.getLogger(__name__)
 
 #: What a malformed call puts in place of an argument.

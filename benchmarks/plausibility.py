@@ -30,8 +30,6 @@ from sim.session.session import Session
 from sim.tasks.task import load_benchmark
 from sim.world.world import World
 
-__all__ = ["Findings", "main", "measure"]
-
 Array = NDArray[np.float64]
 _TICK_S: Final = 0.02
 #: Ticks between two measurements of what is inside what, which cost more than a tick.

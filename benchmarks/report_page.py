@@ -15,7 +15,7 @@ from pathlib import Path
 
 from configs.help import asks_for_help
 from proprio_mllm.report.html import page, run_data
-from proprio_mllm.report.runs import load_run
+from proprio_mllm.report.stored import load_run
 from tests.browser import Browser, chromium
 
 _TIMED = "(() => {{ const start = performance.now(); {} document.body.offsetHeight; return performance.now() - start; }})()"

@@ -25,8 +25,6 @@ from sim.session.session import FreePlay, Session
 from sim.tools.video import VideoRecorder
 from sim.world.world import World
 
-__all__ = ["SCENES", "Scene", "film", "main"]
-
 _TABLE: Final = "DiningTable_1"
 #: Stills of a strip, evenly over the film, and control ticks between those that are taken.
 _STILLS: Final = 9

@@ -19,7 +19,7 @@ from configs.schema.eval import EvalConfig
 from configs.validate import build
 from interface.episode import Outcome
 from proprio_mllm.evaluation.run import evaluate, select_tasks
-from proprio_mllm.report.runs import load_run
+from proprio_mllm.report.stored import load_run
 from sim.tasks.task import write_tasks
 
 

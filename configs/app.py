@@ -24,8 +24,6 @@ from configs.compose import COMPOSITION_ERRORS, CONFIG_DIR, explain, open_fields
 from configs.help import asks_for_help, help_text
 from configs.validate import ConfigError, build
 
-__all__ = ["JobFailed", "run_app"]
-
 T = TypeVar("T")
 
 _FLAGS: Final = """

@@ -18,8 +18,6 @@ import yaml
 from configs.help import asks_for_help, tool_help
 from configs.validate import ConfigError, allowed_values, build
 
-__all__ = ["EXTRAS", "announce", "command", "dispatch", "needed_extra", "read_arguments", "read_named"]
-
 #: Modules that only an extra of pyproject.toml brings.
 EXTRAS: Final = {
     "train": (

@@ -13,8 +13,6 @@ from typing import Final
 
 from configs.validate import ConfigError
 
-__all__ = ["ASSETS_VARIABLE", "KINDS", "asset_files", "own_files"]
-
 ASSETS_VARIABLE: Final = "DUALTHOR_ASSETS"
 KINDS: Final = ("rooms", "types", "robots", "contingency")
 

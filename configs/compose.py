@@ -25,8 +25,6 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from configs.assets import own_files
 from configs.validate import ConfigError, allowed_values
 
-__all__ = ["COMPOSITION_ERRORS", "CONFIG_DIR", "compose", "explain", "group_file", "groups", "open_fields", "register"]
-
 CONFIG_DIR = Path(__file__).resolve().parent
 #: What Hydra raises when overrides do not compose.
 COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException)

@@ -17,8 +17,6 @@ import yaml
 
 from configs.compose import CONFIG_DIR, compose, groups
 
-__all__ = ["asks_for_help", "help_text", "shows_help", "tool_help"]
-
 _WIDTH: Final = 110
 #: Stands for a field that has no default.
 _UNSET: Final = object()

@@ -14,8 +14,6 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-__all__ = ["ConfigError", "allowed_values", "build"]
-
 T = TypeVar("T")
 #: Longest list of allowed values that is printed whole.
 _LISTED: Final = 60

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from data.script import Script
 
-__all__ = ["ACTIVITIES", "DIRECTIONS", "HEIGHTS", "RECIPES"]
-
 Array = NDArray[np.float64]
 Phrases = list[str]
 Activity = Callable[[Script], Phrases]

@@ -27,8 +27,6 @@ from data.motion import FPS, resample
 from data.omomo import on_floor
 from data.skeleton import JOINTS, PARENTS, HumanMotion, index
 
-__all__ = ["GENDERS", "BodyModel", "find_model", "load_amass", "load_model", "require_smplx"]
-
 Array = NDArray[np.float64]
 GENDERS: Final = ("female", "male", "neutral")
 #: Kind of body model by the width of `poses`, three numbers per joint.

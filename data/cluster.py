@@ -14,8 +14,6 @@ import os
 from collections.abc import Iterator
 from typing import Any, Final
 
-__all__ = ["import_ray", "ray_instance"]
-
 #: One thread per worker, drawing without a screen, nothing from a hub.
 _ENVIRONMENT: Final = {
     "OMP_NUM_THREADS": "1",

@@ -16,8 +16,6 @@ from typing import Any, Literal
 
 from data.files import file_hash
 
-__all__ = ["CodeFileError", "load_named", "source_digest", "split_source"]
-
 
 class CodeFileError(ValueError):
     """Code that cannot be used; the message names the file and what is wrong."""

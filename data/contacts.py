@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from data.skeleton import index
 
-__all__ = ["CONTACT_HEIGHT_M", "CONTACT_SPEED_MPS", "contact_runs", "lock", "toe_contacts"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 CONTACT_HEIGHT_M: Final = 0.06

@@ -18,18 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "DamagedFileError",
-    "cache_folder",
-    "file_hash",
-    "new_folder",
-    "parse_json",
-    "read_cached",
-    "read_json",
-    "write_cached",
-    "write_text",
-]
-
 
 class DamagedFileError(ValueError):
     """A file of this project's own that cannot be read; the message names it and what is wrong."""

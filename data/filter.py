@@ -26,8 +26,6 @@ from data.contacts import contact_runs
 from data.metrics import Metrics
 from data.skeleton import HumanMotion, index
 
-__all__ = ["GATES", "PhcDecision", "admit", "apply_phc_list", "automatic_rule", "gate", "phc_list", "reason_group"]
-
 _START_AIR_M: Final = 0.1
 _TOES_UP_M: Final = 0.2
 _TOES_UP_FRAMES: Final = 30

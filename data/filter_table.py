@@ -22,8 +22,6 @@ from data.filter import GATES, phc_list, reason_group
 from data.humanml3d import DatasetError, list_clips
 from data.shards import Manifest, ShardError
 
-__all__ = ["list_counts", "main", "manifest_table", "shard_counts"]
-
 _USAGE = "usage: python -m proprio_mllm report filter FOLDER (clips shards, or a folder in HumanML3D's format)\n"
 
 

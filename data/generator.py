@@ -23,8 +23,6 @@ from data.representation import joints_from_vectors, vectors_from_joints
 from data.script import Script
 from data.skeleton import Caption, HumanMotion, to_y_up
 
-__all__ = ["GENERATOR_VERSION", "generate_clip", "write_dataset"]
-
 Array = NDArray[np.float64]
 #: Raised when the same seed gives other clips than before.
 GENERATOR_VERSION: Final = 4

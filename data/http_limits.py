@@ -15,8 +15,6 @@ from typing import Any, Final
 
 from configs.schema.checks import is_loopback
 
-__all__ = ["LimitedHandler", "LimitedServer", "body_length", "has_left"]
-
 _FULL: Final = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nRetry-After: 1\r\nConnection: close\r\n\r\n"
 #: Digits of a length that is worth reading.
 _DIGITS: Final = 12

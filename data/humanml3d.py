@@ -21,8 +21,6 @@ from data.motion import FPS
 from data.representation import VECTOR_SIZE, joints_from_vectors
 from data.skeleton import JOINTS, Caption, HumanMotion, to_z_up
 
-__all__ = ["DatasetError", "Skipped", "check_joints", "list_clips", "load_clip", "load_dataset", "parse_captions"]
-
 logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 _MIN_FRAMES: Final = 10

@@ -21,8 +21,6 @@ from robots.kinematics import RobotModel
 from robots.leg_ik import crouch
 from robots.spec import RobotSpec
 
-__all__ = ["JointAngles"]
-
 Array = NDArray[np.float64]
 _FIRST_ITERATIONS: Final = 60
 _ITERATIONS: Final = 6

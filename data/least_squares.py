@@ -17,8 +17,6 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.linalg.lapack import get_lapack_funcs
 
-__all__ = ["BoundedSearch", "System"]
-
 Array = NDArray[np.float64]
 #: Configuration to Jacobian (R, N) of the columns that move, and residual (R,), both weighted.
 System = Callable[[Array], tuple[Array, Array]]

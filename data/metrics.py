@@ -23,19 +23,6 @@ from data.self_contact import DEEP_M
 from data.skeleton import HumanMotion, index
 from data.targets import Targets
 
-__all__ = [
-    "Metrics",
-    "angle_deg",
-    "balance_cm",
-    "evaluate",
-    "evaluate_joints",
-    "jerk_rad_s3",
-    "limit_violation_pct",
-    "pa_mpjpe_cm",
-    "saturation_pct",
-    "skate_cm_s",
-]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _ARM_BONES: Final = (("shoulder", "elbow"), ("elbow", "wrist"))

@@ -21,26 +21,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from interface.bodies import KEY_BODIES
 
-__all__ = [
-    "FEATURES",
-    "FPS",
-    "HAND_OPENING",
-    "KEY_BODY_COUNT",
-    "N_FEATURES",
-    "OPEN_HAND",
-    "PELVIS_HEIGHT",
-    "PLANAR_VELOCITY",
-    "YAW_RATE",
-    "decode_key_bodies",
-    "decode_root",
-    "encode_frames",
-    "heading_to_world",
-    "resample",
-    "world_to_heading",
-    "wrap_angle",
-    "yaw_from_quaternion",
-]
-
 #: Frames per second of every stored motion.
 FPS: Final = 20.0
 KEY_BODY_COUNT: Final = len(KEY_BODIES)

@@ -22,8 +22,6 @@ from data.humanml3d import DatasetError, check_joints
 from data.motion import FPS, resample
 from data.skeleton import HumanMotion, index
 
-__all__ = ["demo_motions", "find_demo_clips", "level_parts", "load_mocap", "load_omomo", "on_floor"]
-
 Array = NDArray[np.float64]
 _OMOMO_FPS: Final = 30.0
 _OMOMO_JOINTS: Final = slice(162, 162 + 52 * 3)

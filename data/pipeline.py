@@ -34,8 +34,6 @@ from data.workers import worker_pool
 from interface.motion import Motion
 from robots.spec import load_robot
 
-__all__ = ["PartResult", "Pictures", "Replay", "build_clips", "dataset_folder", "part_of_clips"]
-
 #: Raised when the same configuration gives other shards than before.
 _VERSION: Final = 1
 #: Fields that do not decide what is in the shards.

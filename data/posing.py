@@ -19,17 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from data.skeleton import JOINTS, index
 
-__all__ = [
-    "ANKLE_HEIGHT_M",
-    "ARM_LENGTH_M",
-    "FOOT_SPREAD_M",
-    "SHOULDER_HEIGHT_M",
-    "STANDING_HEIGHT_M",
-    "Channels",
-    "pose",
-    "two_bone",
-]
-
 Array = NDArray[np.float64]
 
 THIGH_M: Final = 0.386

@@ -21,8 +21,6 @@ from scipy.ndimage import gaussian_filter1d
 
 from data.skeleton import CHAINS, JOINTS
 
-__all__ = ["VECTOR_SIZE", "joints_from_vectors", "vectors_from_joints"]
-
 Array = NDArray[np.float64]
 VECTOR_SIZE: Final = 263
 _CONTACT_SPEED: Final = 0.002  # squared metres per frame

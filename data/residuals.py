@@ -23,8 +23,6 @@ from interface.bodies import SIDES
 from robots.kinematics import RobotModel
 from robots.self_collision import close_rows, default_shapes, moved_by, solid_on
 
-__all__ = ["BodyFrames", "Residuals"]
-
 Array = NDArray[np.float64]
 _PELVIS: Final = 6.0
 _PELVIS_ROTATION: Final = 2.0

@@ -35,8 +35,6 @@ from robots.kinematics import RobotModel
 from robots.leg_ik import crouch
 from robots.spec import RobotSpec
 
-__all__ = ["MAX_JOINT_VELOCITY", "Measured", "Retargeted", "Retargeter"]
-
 Array = NDArray[np.float64]
 #: rad/s; the slowest limit in H1's vendor description (ankles and shoulders), used for both robots.
 MAX_JOINT_VELOCITY: Final = 9.0

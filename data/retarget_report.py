@@ -28,8 +28,6 @@ from data.skeleton import HumanMotion
 from data.tracking import Tracker, Tracking
 from robots.spec import available_robots, load_robot
 
-__all__ = ["PHYSICS", "TARGETS", "Column", "main", "measure", "table"]
-
 #: Metric, its heading and what the project aims at.
 TARGETS: Final = {
     "hand_cm": "1",

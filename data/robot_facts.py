@@ -15,8 +15,6 @@ from interface.bodies import KEY_BODIES, SIDES
 from robots.kinematics import RobotModel
 from robots.spec import RobotSpec, load_robot
 
-__all__ = ["RobotFacts", "robot_facts"]
-
 
 @dataclass(frozen=True, slots=True)
 class RobotFacts:

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 
 from data.posing import ANKLE_HEIGHT_M, ARM_LENGTH_M, FOOT_SPREAD_M, SHOULDER_HEIGHT_M, STANDING_HEIGHT_M, Channels, pose
 
-__all__ = ["Script", "minimum_jerk"]
-
 Array = NDArray[np.float64]
 _SWING_HEIGHT_M: Final = 0.075
 #: Greatest slow drift of pelvis and hands (m) and of the trunk's angles (rad), and its frequencies (Hz).

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from robots.kinematics import RobotModel
 from robots.leg_ik import crouch
 
-__all__ = ["DEEP_M", "SelfContact"]
-
 Array = NDArray[np.float64]
 #: Depth from which a contact counts as self-collision.
 DEEP_M: Final = 0.01

@@ -13,8 +13,6 @@ from typing import Any, Final
 
 import datasets
 
-__all__ = ["KINDS"]
-
 _TEXT, _INT, _FLOAT, _BYTES = (datasets.Value(name) for name in ("string", "int32", "float32", "binary"))
 
 

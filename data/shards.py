@@ -31,21 +31,6 @@ from data.files import file_hash, write_text
 from data.motion import N_FEATURES
 from data.shard_kinds import KINDS
 
-__all__ = [
-    "KINDS",
-    "SCHEMA_VERSION",
-    "Manifest",
-    "ShardError",
-    "ShardReader",
-    "ShardWriter",
-    "config_hash",
-    "decode_depth",
-    "decode_motion",
-    "decode_png",
-    "decode_segmentation",
-    "encode_png",
-]
-
 SCHEMA_VERSION: Final = 2
 _MANIFEST: Final = "manifest.json"
 

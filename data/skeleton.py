@@ -14,8 +14,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["CHAINS", "JOINTS", "PARENTS", "Caption", "HumanMotion", "index", "mirrored", "to_y_up", "to_z_up"]
-
 Array = NDArray[np.float64]
 
 JOINTS: Final = (

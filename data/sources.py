@@ -20,8 +20,6 @@ from data.humanml3d import DatasetError, list_clips, load_clip, parse_captions
 from data.omomo import load_mocap, load_omomo
 from data.skeleton import Caption, HumanMotion
 
-__all__ = ["SUFFIXES", "activity", "clip_ids", "load_file", "read_clip"]
-
 #: What a folder of files may hold, by source.
 SUFFIXES: Final = {"amass": (".npz",), "folder": (".npy", ".npz", ".pt")}
 #: Files of AMASS that are bodies, not motions.

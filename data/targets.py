@@ -19,8 +19,6 @@ from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 from data.contacts import lock, toe_contacts
 from data.skeleton import HumanMotion, index
 
-__all__ = ["Measures", "Targets", "make_targets"]
-
 Array = NDArray[np.float64]
 
 

@@ -29,8 +29,6 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from interface.motion import Motion
 from robots.kinematics import RobotModel
 
-__all__ = ["FAILED_M", "Tracked", "Tracker", "Tracking"]
-
 Array = NDArray[np.float64]
 #: PHC's limit for the mean body error.
 FAILED_M: Final = 0.5

@@ -11,8 +11,6 @@ import os
 import threading
 from concurrent.futures import ProcessPoolExecutor
 
-__all__ = ["start_worker", "worker_pool"]
-
 
 def worker_pool(workers: int) -> ProcessPoolExecutor:
     """A pool of so many of these processes."""

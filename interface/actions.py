@@ -18,18 +18,6 @@ from interface.facts import Call, Facts, Situation
 from interface.failures import FailureCode
 from interface.requirements import Requirement, need, where
 
-__all__ = [
-    "ACTIONS",
-    "ActionKind",
-    "ActionSpec",
-    "Amount",
-    "Refusal",
-    "bringing_about",
-    "exclude_each_other",
-    "first_refusal",
-    "given_amount",
-]
-
 
 class ActionKind(StrEnum):
     """What an action occupies: the whole body, one arm, both arms, or nothing (episode control)."""

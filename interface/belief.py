@@ -20,8 +20,6 @@ from interface.observation import HistoryItem
 from interface.steps import Action
 from interface.symbolic import Event, SymbolicState, events_of
 
-__all__ = ["ARM_SPECIFIC", "UNKNOWN", "Belief"]
-
 #: What a hand holds when a code says that it is full and nobody knows of what.
 UNKNOWN: Final = "?"
 #: Codes after which the other arm may do what one could not.

@@ -5,8 +5,6 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Final
 
-__all__ = ["DEFAULT_ROBOT", "KEY_BODIES", "PAPER_ROBOTS", "SIDES", "Arm"]
-
 #: The robots of the paper, and the one that is taken where nobody says which.
 PAPER_ROBOTS: Final = ("h1", "x1")
 DEFAULT_ROBOT: Final = PAPER_ROBOTS[0]

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
-__all__ = ["Become", "Condition", "Effect", "Grasp", "HoldOpen", "LetGo", "PutDown", "Rise", "Turn", "Walk"]
-
 
 class Condition(StrEnum):
     """States of objects that actions change."""

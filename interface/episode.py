@@ -9,8 +9,6 @@ from typing import Final
 
 from interface.failures import FailureCategory
 
-__all__ = ["STEP_LIMIT", "EpisodeRecord", "Outcome"]
-
 #: Environment steps of an episode. Paper: 50.
 STEP_LIMIT: Final = 50
 

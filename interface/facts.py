@@ -13,8 +13,6 @@ from typing import Final, Protocol
 
 from interface.bodies import Arm
 
-__all__ = ["FILLED_SHARE", "FULL_SHARE", "Affordances", "Call", "Facts", "ObjectFacts", "Objects", "Situation"]
-
 #: Shares of a door's travel: from which on it counts as open, beyond which Open, and below which Close, has nothing left to do.
 _OPEN, _OPENED, _CLOSED = 1.0 / 3.0, 0.6, 0.06
 #: Shares of a vessel's volume from which on it counts as filled, and as full.

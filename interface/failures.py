@@ -18,8 +18,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-__all__ = ["FAILED", "FAILURES", "INVALID_OUTPUT", "FailureCategory", "FailureCode", "FailureSpec"]
-
 #: What a log says of a reply that is no step of the grammar; no action failed, so it is no failure code.
 INVALID_OUTPUT: Final = "InvalidOutput"
 #: What a log says of every failed action where failures are told as one bit.

@@ -9,8 +9,6 @@ from interface.actions import ActionKind
 from interface.failures import FAILURES, FailureCategory, FailureCode
 from interface.steps import Action
 
-__all__ = ["ActionOutcome", "Feedback", "category_of"]
-
 
 @dataclass(frozen=True, slots=True)
 class ActionOutcome:

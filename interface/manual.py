@@ -10,8 +10,6 @@ from typing import Final
 from interface.actions import ACTIONS, ActionKind, ActionSpec
 from interface.failures import FAILURES, INVALID_OUTPUT
 
-__all__ = ["action_manual", "code_manual"]
-
 _UNITS: Final = {"m": "metres", "deg": "degrees"}
 
 

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Motion"]
-
 
 @dataclass(frozen=True, slots=True)
 class Motion:

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from interface.episode import STEP_LIMIT
 
-__all__ = ["Camera", "HistoryItem", "Observation", "Proprioception"]
-
 
 @dataclass(frozen=True, slots=True)
 class Camera:

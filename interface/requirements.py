@@ -13,25 +13,6 @@ from typing import Final
 from interface.facts import Situation
 from interface.failures import FailureCode
 
-__all__ = [
-    "ACCESSIBLE",
-    "ANY_HOLD",
-    "BASE_FREE",
-    "BOTH_FREE",
-    "BOTH_HOLD",
-    "FREE_HAND",
-    "FREE_RECEPTACLE",
-    "HAND_HOLDS",
-    "NOT_BROKEN",
-    "ONE_HAND_LOAD",
-    "STEADY",
-    "TWO_HAND_LOAD",
-    "VESSEL",
-    "Requirement",
-    "need",
-    "where",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class Requirement:

@@ -12,8 +12,6 @@ from typing import Protocol
 from interface.belief import Belief
 from interface.observation import HistoryItem
 
-__all__ = ["Seen", "Shown", "Sightings"]
-
 
 class Seen(Protocol):
     """The part of an observation that is told in words; `interface.observation.Observation` is one."""

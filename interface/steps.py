@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from interface.actions import ACTIONS, ActionKind, ActionSpec, given_amount
 from interface.bodies import Arm
 
-__all__ = ["Action", "ActionError", "PlanStep"]
-
 _CALL = re.compile(r"^([A-Za-z]{1,32})\(([^()]{0,160})\)$")
 _OBJECT_ID = re.compile(r"^[A-Za-z][A-Za-z0-9_]{0,47}$")
 

@@ -15,8 +15,6 @@ from interface.facts import Call
 from interface.observation import HistoryItem
 from interface.steps import Action, ActionError
 
-__all__ = ["Event", "SymbolicState", "events_of"]
-
 
 @dataclass(frozen=True, slots=True)
 class Event:

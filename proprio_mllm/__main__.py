@@ -7,8 +7,6 @@ from typing import Final
 
 from configs.arguments import dispatch
 
-__all__ = ["COMMANDS", "main"]
-
 COMMANDS: Final = {
     "report": ("proprio_mllm.report.commands", "tables, pages, films and exports of runs, motion data and tokenizers"),
     "bodyqa": ("proprio_mllm.report.bodyqa", "questions about what a model sees and feels of its own body"),

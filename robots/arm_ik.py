@@ -13,8 +13,6 @@ from robots.pink_core import PinkCore
 from robots.self_collision import SELF_TOUCH_M
 from robots.solver import IkResult, ReachTarget
 
-__all__ = ["PerArmSolver"]
-
 Array = NDArray[np.float64]
 
 

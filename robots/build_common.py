@@ -14,21 +14,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "HAND_FRICTION",
-    "NO_CONTACT",
-    "ROBOT_AFFINITY",
-    "ROBOT_BIT",
-    "add_landmarks",
-    "add_servo",
-    "damp_servos",
-    "shell",
-    "shell_box",
-    "stiffen_limits",
-    "tune_joint",
-    "zero_pose",
-]
-
 ROBOT_BIT = 4
 ROBOT_AFFINITY = 3
 HAND_FRICTION = (1.5, 0.02, 0.001)

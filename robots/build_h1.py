@@ -27,8 +27,6 @@ from robots.build_common import (
 )
 from robots.csv_tree import LinkRow, add_link, read_rows
 
-__all__ = ["build_h1", "reduce_mesh"]
-
 SKIN = [0.16, 0.16, 0.18, 1.0]
 #: Triangles kept per mesh; the Menagerie meshes have 286 k together, which costs 10 x in rendering on a CPU.
 FACES = {"torso_link": 2000, "pelvis": 450}

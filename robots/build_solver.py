@@ -9,8 +9,6 @@ from robots.solver import ArmSolver
 from robots.spec import RobotSpec, load_robot
 from robots.whole_body_ik import WholeBodySolver
 
-__all__ = ["SOLVERS", "RobotKit", "robot_kit"]
-
 _KITS: dict[tuple[str, str, str], RobotKit] = {}
 SOLVERS = {"whole_body": WholeBodySolver, "per_arm": PerArmSolver}
 

@@ -26,8 +26,6 @@ from robots.build_common import (
 )
 from robots.csv_tree import add_link, read_rows, set_inertia
 
-__all__ = ["build_x1"]
-
 WHITE = (0.86, 0.87, 0.9, 1.0)
 GREY = (0.35, 0.37, 0.42, 1.0)
 ORANGE = (0.9, 0.45, 0.1, 1.0)

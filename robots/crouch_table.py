@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from robots.kinematics import RobotModel, root_quaternion
 from robots.leg_ik import Crouch, crouch
 
-__all__ = ["CrouchTable"]
-
 Array = NDArray[np.float64]
 
 

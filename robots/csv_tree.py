@@ -10,8 +10,6 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-__all__ = ["LinkRow", "add_link", "read_rows"]
-
 
 @dataclass(frozen=True, slots=True)
 class LinkRow:

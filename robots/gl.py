@@ -10,8 +10,6 @@ import ctypes.util
 import os
 from typing import Final
 
-__all__ = ["BACKENDS", "RenderingError", "select_backend"]
-
 BACKENDS: Final = ("egl", "osmesa", "glfw")
 
 

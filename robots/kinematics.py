@@ -14,8 +14,6 @@ from interface.bodies import KEY_BODIES
 from robots.self_collision import OwnBody
 from robots.spec import RobotSpec
 
-__all__ = ["RobotModel", "root_quaternion"]
-
 Array = NDArray[np.float64]
 
 

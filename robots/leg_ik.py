@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from robots.kinematics import RobotModel, root_quaternion
 
-__all__ = ["Crouch", "crouch", "pelvis_height_range", "solve_legs"]
-
 Array = NDArray[np.float64]
 #: Sole error above which a height counts as out of reach.
 SOLE_TOLERANCE_M = 1e-3

@@ -28,8 +28,6 @@ from robots.kinematics import RobotModel, root_quaternion
 from robots.self_collision import SELF_TOUCH_M, SelfLimit
 from robots.solver import IkResult, ReachTarget
 
-__all__ = ["PinkCore"]
-
 Array = NDArray[np.float64]
 _DT_S = 0.1
 #: Largest change of a joint in one iteration, and Levenberg-Marquardt damping: both keep far targets from oscillating.

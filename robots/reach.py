@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from robots.build_solver import RobotKit
 from robots.solver import ReachTarget
 
-__all__ = ["Reach", "reach_over_heights"]
-
 Array = NDArray[np.float64]
 
 

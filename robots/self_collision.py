@@ -26,8 +26,6 @@ from pink.limits import Limit
 from interface.bodies import SIDES
 from robots.spec import BodyShape, RobotSpec
 
-__all__ = ["SELF_TOUCH_M", "OwnBody", "SelfLimit", "close_rows", "default_shapes", "moved_by", "solid_on"]
-
 Array = NDArray[np.float64]
 
 #: Penetration of the shapes that still counts as touching only; they are a little larger than the body.

@@ -13,8 +13,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ArmSolver", "IkResult", "ReachTarget", "rotation_from_axes"]
-
 Array = NDArray[np.float64]
 
 

@@ -19,8 +19,6 @@ from configs.assets import asset_files
 from configs.validate import ConfigError, build
 from interface.bodies import KEY_BODIES, SIDES
 
-__all__ = ["ArmSpec", "BodyShape", "FootSpec", "HandSpec", "RobotSpec", "available_robots", "load_robot"]
-
 _SPECS = Path(__file__).parent / "specs"
 
 

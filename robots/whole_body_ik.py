@@ -16,8 +16,6 @@ from robots.kinematics import RobotModel
 from robots.pink_core import PinkCore
 from robots.solver import IkResult, ReachTarget
 
-__all__ = ["WholeBodySolver"]
-
 Array = NDArray[np.float64]
 
 

@@ -7,8 +7,6 @@ from typing import Final
 
 from configs.arguments import dispatch
 
-__all__ = ["COMMANDS", "main"]
-
 COMMANDS: Final = {
     "doctor": ("sim.tools.doctor", "what this machine has of what is needed, and what to do about the rest"),
     "look": ("sim.tools.look", "pictures of rooms, object types and robots"),

@@ -19,10 +19,9 @@ from configs.arguments import command, read_arguments
 from configs.compose import compose
 from configs.schema.eval import CHAT_KINDS, EvalConfig
 from configs.validate import build
-from proprio_mllm.report.runs import Run, find_runs, newest
+from proprio_mllm.report.runs import newest
 from proprio_mllm.report.statistics import wilson
-
-__all__ = ["Needed", "ReproduceConfig", "agreements", "main", "needed"]
+from proprio_mllm.report.stored import Run, find_runs
 
 EXPERIMENTS: Final = {
     "main": "main_table",

@@ -9,8 +9,6 @@ from urllib.parse import urlsplit
 
 from configs.schema.checks import is_loopback, require, require_used
 
-__all__ = ["BackendConfig", "BackendKind"]
-
 BackendKind = Literal["openai", "local", "replay", "scripted"]
 #: Fields that not every kind uses; elsewhere they keep their defaults, so that none is ignored. `replay` names what was asked.
 _OF_KINDS: Final[Mapping[str, tuple[BackendKind, ...]]] = {

@@ -8,8 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields
 from typing import Any
 
-__all__ = ["defaults_of", "is_loopback", "require", "require_used"]
-
 
 def require(condition: bool, message: str) -> None:
     """Refuses a value.

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-__all__ = ["DataConfig", "GateConfig", "ReplayConfig"]
-
 _HOLDS: Final = {"humanml3d": "new_joints", "amass": "npz", "folder": "motions"}
 
 

@@ -11,19 +11,6 @@ from configs.schema.backend import BackendConfig
 from configs.schema.checks import defaults_of, require, require_used
 from configs.schema.robot import RobotConfig
 
-__all__ = [
-    "CHAT_KINDS",
-    "CategoryName",
-    "DifficultyName",
-    "EvalConfig",
-    "ExperimentConfig",
-    "ExperimentName",
-    "PlannerConfig",
-    "PlannerKind",
-    "SplitName",
-    "StartName",
-]
-
 CategoryName = Literal["all", "single", "optional", "essential"]
 DifficultyName = Literal["easy", "medium", "hard", "natural"]
 SplitName = Literal["all", "seen", "unseen"]

@@ -12,17 +12,6 @@ from typing import Literal
 
 from configs.schema.checks import require
 
-__all__ = [
-    "CseConfig",
-    "LoraConfig",
-    "ModelConfig",
-    "MotionTokenizerConfig",
-    "MpeConfig",
-    "PointMapConfig",
-    "TinyTextConfig",
-    "TinyVisionConfig",
-]
-
 MpeMode = Literal["mrope", "rope_sign", "rope_sign_raw", "rope_radial", "embed_sign", "rope_sign+embed"]
 #: Frames of proprioception in shards and observations.
 LONGEST_WINDOW = 64

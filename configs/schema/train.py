@@ -9,20 +9,6 @@ from configs.schema.checks import require
 from configs.schema.data import DataConfig
 from configs.schema.model import ModelConfig
 
-__all__ = [
-    "AlignmentConfig",
-    "BaseConfig",
-    "CollectStageConfig",
-    "LoggerConfig",
-    "LoopConfig",
-    "PracticeConfig",
-    "SeluConfig",
-    "StageName",
-    "TrainConfig",
-    "Variant",
-    "WordsConfig",
-]
-
 #: Training tasks have 2^31 seeds, a million for each seed of a run.
 LARGEST_SEED = 2000
 StageName = Literal["all", "data", "collect", "words", "practice", "base", "pointmap", "tokenizer", "alignment", "selu"]

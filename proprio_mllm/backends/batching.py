@@ -18,8 +18,6 @@ from typing import Generic, TypeVar
 
 from proprio_mllm.backends.protocol import BackendError
 
-__all__ = ["Batcher"]
-
 Q = TypeVar("Q")
 A = TypeVar("A")
 

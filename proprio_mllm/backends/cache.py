@@ -33,8 +33,6 @@ from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import Backend, BackendError, BackendSetupError, ChatReply, ChatRequest
 from proprio_mllm.backends.replies import RecordedCall, ReplyStore, question_of
 
-__all__ = ["CachedBackend", "ReplayBackend", "main", "recorded_revision"]
-
 _VERSION: Final = 1
 _USAGE: Final = "expected FILE [show=KEY] [export=FILE.jsonl] [import=FILE.jsonl]"
 _SHOWN_CHARACTERS: Final = 80

@@ -32,8 +32,6 @@ from configs.schema.backend import BackendConfig
 from proprio_mllm.backends.protocol import BackendSetupError
 from proprio_mllm.model.processor import ProprioProcessor
 
-__all__ = ["Checkpoint", "InternVLImages", "Loaded", "QwenImages", "find_checkpoint", "load_chat_processor", "load_checkpoint"]
-
 #: Files that decide replies; larger ones than this enter the fingerprint by sample.
 _SUFFIXES: Final = frozenset({".json", ".jinja", ".model", ".safetensors", ".txt"})
 _WHOLE_BYTES: Final = 16 * 2**20

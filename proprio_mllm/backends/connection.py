@@ -23,8 +23,6 @@ import openai
 
 from proprio_mllm.backends.protocol import BackendSetupError
 
-__all__ = ["MAX_REPLY_BYTES", "ReplyTooLongError", "Secret", "bounded_client", "checked_url", "read_secret"]
-
 #: Longest body that is read, bytes; a chat completion of 2,048 tokens has about 10 kB.
 MAX_REPLY_BYTES: Final = 16 * 2**20
 _CONNECT_S: Final = 15.0

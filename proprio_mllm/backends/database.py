@@ -16,8 +16,6 @@ from typing import Any, Final
 
 from proprio_mllm.backends.protocol import BackendError, BackendSetupError
 
-__all__ = ["Database", "Tables"]
-
 #: How long a call waits for the writes of others.
 _BUSY_S: Final = 30.0
 

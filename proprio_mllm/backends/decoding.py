@@ -26,8 +26,6 @@ from transformers import LogitsProcessor, StoppingCriteria
 
 from proprio_mllm.backends.protocol import BackendSetupError, RequestError
 
-__all__ = ["GrammarState", "Grammars", "Limits", "Rule", "Rules", "import_xgrammar"]
-
 
 class GrammarState:
     """How far one reply has come in its grammar, an xgrammar `GrammarMatcher`."""

@@ -20,8 +20,6 @@ from proprio_mllm.backends.scripted import ScriptedChat
 from proprio_mllm.backends.slots import SlottedBackend
 from proprio_mllm.backends.spending import Spending, SpendingBackend
 
-__all__ = ["SPENDING_FILE", "check_cap", "make_backend", "told_revision"]
-
 #: In a run's folder.
 SPENDING_FILE: Final = "spending.sqlite"
 

@@ -12,8 +12,6 @@ from pathlib import Path
 from configs.schema.backend import BackendConfig
 from data.code_files import source_digest
 
-__all__ = ["identity_of"]
-
 
 def identity_of(cfg: BackendConfig) -> str:
     """Canonical JSON of model, revision and what is fixed in the configuration; the rest is in every request.

@@ -34,8 +34,6 @@ from proprio_mllm.backends.decoding import Grammars, GrammarState, Limits, Rule,
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import BackendError, ChatImage, ChatMessage, ChatReply, ChatRequest, RequestError
 
-__all__ = ["LocalChat", "Row", "encode", "open_picture"]
-
 #: Longest side of a picture, in pixels.
 _LARGEST_SIDE: Final = 4096
 

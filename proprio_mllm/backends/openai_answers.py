@@ -38,8 +38,6 @@ from proprio_mllm.backends.protocol import (
     UnreachableError,
 )
 
-__all__ = ["failure_of", "is_refusal", "read_completion", "shown_name"]
-
 _FINISHED: Final[Mapping[str, FinishReason]] = {
     "length": "length",
     "max_tokens": "length",

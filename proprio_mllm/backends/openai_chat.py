@@ -33,8 +33,6 @@ from proprio_mllm.backends.protocol import (
 )
 from proprio_mllm.backends.structured import strict_schema
 
-__all__ = ["OpenAIChat"]
-
 #: Given explicitly, because the client would otherwise take another one from the environment.
 _OPENAI_URL: Final = "https://api.openai.com/v1"
 _SHOWN_CHARACTERS: Final = 400

@@ -18,8 +18,6 @@ import yaml
 from configs.validate import ConfigError, build
 from proprio_mllm.backends.protocol import ChatImage, ChatRequest
 
-__all__ = ["LongPrice", "Price", "price_of", "price_table"]
-
 _FILE: Final = Path(__file__).with_name("prices.yaml")
 _VERSION: Final = 1
 _PER_TOKEN: Final = 1e-6

@@ -16,21 +16,6 @@ from typing import Literal, Protocol, runtime_checkable
 
 from pydantic import BaseModel
 
-__all__ = [
-    "Backend",
-    "BackendError",
-    "BackendSetupError",
-    "ChatImage",
-    "ChatMessage",
-    "ChatReply",
-    "ChatRequest",
-    "CostCapError",
-    "FinishReason",
-    "LostReplyError",
-    "RequestError",
-    "UnreachableError",
-]
-
 #: How a reply ended: by itself, cut off at `max_tokens`, or refused by the model or its filter.
 FinishReason = Literal["stop", "length", "refusal"]
 

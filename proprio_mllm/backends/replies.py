@@ -22,8 +22,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from proprio_mllm.backends.database import Database, Tables
 from proprio_mllm.backends.protocol import BackendSetupError, ChatMessage, ChatReply, ChatRequest
 
-__all__ = ["RecordedCall", "RecordedReply", "ReplyStore", "question_of"]
-
 _TABLES: Final = Tables(
     purpose="recorded replies",
     application=0x50524D52,

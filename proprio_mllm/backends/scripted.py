@@ -16,8 +16,6 @@ from data.code_files import CodeFileError, load_named
 from proprio_mllm.backends.identity import identity_of
 from proprio_mllm.backends.protocol import BackendError, BackendSetupError, ChatReply, ChatRequest
 
-__all__ = ["ScriptedChat"]
-
 
 class ScriptedChat:
     """Calls the function.

@@ -30,8 +30,6 @@ from proprio_mllm.backends.local import LocalChat
 from proprio_mllm.backends.protocol import BackendSetupError
 from proprio_mllm.backends.server import ChatServer
 
-__all__ = ["ServeConfig", "main"]
-
 
 @dataclass(frozen=True)
 class ServeConfig:

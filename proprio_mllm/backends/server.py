@@ -23,8 +23,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from data.http_limits import LimitedHandler, LimitedServer, body_length
 from proprio_mllm.backends.protocol import Backend, BackendError, ChatImage, ChatMessage, ChatReply, ChatRequest, RequestError
 
-__all__ = ["ChatServer", "RefusedError", "completion", "model_list", "read_request"]
-
 logger = logging.getLogger(__name__)
 
 #: Longest request, bytes; a picture of 500 pixels squared takes about 0.5 MB.

@@ -19,8 +19,6 @@ from filelock import FileLock, Timeout
 
 from proprio_mllm.backends.protocol import Backend, BackendSetupError, ChatReply, ChatRequest
 
-__all__ = ["SlottedBackend"]
-
 _POLL_S: Final = 0.02
 
 

@@ -25,8 +25,6 @@ from proprio_mllm.backends.database import Database, Tables
 from proprio_mllm.backends.prices import Price
 from proprio_mllm.backends.protocol import Backend, BackendError, ChatReply, ChatRequest, CostCapError, LostReplyError
 
-__all__ = ["Spending", "SpendingBackend"]
-
 _TABLES: Final = Tables(
     purpose="a run's spending",
     application=0x50524D53,

@@ -12,8 +12,6 @@ from typing import Any, Final
 
 from pydantic import BaseModel
 
-__all__ = ["strict_schema"]
-
 #: Hints for readers, and limits that strict servers do not hold.
 _LEFT_OUT: Final = frozenset({"title", "default", "examples", "discriminator", "minLength", "maxLength", "uniqueItems"})
 

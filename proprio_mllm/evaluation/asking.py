@@ -18,8 +18,6 @@ from proprio_mllm.backends.batching import Batcher
 from proprio_mllm.planners.protocol import BatchPlanner, PlannerReply, TaskInfo
 from proprio_mllm.planners.registry import make_planner
 
-__all__ = ["AskingPlanner", "ModelDesk", "answer_all", "batch_planner"]
-
 
 def answer_all(
     planner: BatchPlanner, observations: Sequence[Observation], states: Sequence[Any]

@@ -31,9 +31,6 @@ from interface.steps import Action
 if TYPE_CHECKING:
     from sim.tasks.task import Task
 
-__all__ = ["INVALID_OUTPUT", "Deciding", "attribute", "deciding_failure", "unmet_objects"]
-
-#: Feedback code of a reply outside the action grammar.
 #: Codes with which the hand has lost what it was to put down.
 _LOST: Final = (FailureCode.DROPPED, FailureCode.PLACE_MISSED, FailureCode.SLIPPED, FailureCode.BROKE)
 

@@ -35,8 +35,6 @@ from proprio_mllm.planners.protocol import TaskInfo
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 from proprio_mllm.training.rollouts import DaggerRequest
 
-__all__ = ["collect_dagger", "collect_lessons"]
-
 #: Episodes of a part.
 _PER_PART: Final = 10
 

@@ -24,28 +24,14 @@ from typing import Any, Final, Literal, Protocol
 import numpy as np
 
 from interface.episode import STEP_LIMIT, EpisodeRecord, Outcome
+from interface.failures import INVALID_OUTPUT
 from interface.feedback import Feedback
 from interface.observation import HistoryItem, Observation
 from interface.steps import PlanStep
-from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, attribute
+from proprio_mllm.evaluation.attribution import attribute
 from proprio_mllm.evaluation.seeds import stream
 from proprio_mllm.evaluation.showing import Showing
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo, Usage
-
-__all__ = [
-    "Ask",
-    "Begin",
-    "Episode",
-    "EpisodeKeyFields",
-    "GoalReport",
-    "Limits",
-    "RunnableSession",
-    "Stats",
-    "Watcher",
-    "answer",
-    "episode_steps",
-    "run_episode",
-]
 
 logger = logging.getLogger(__name__)
 

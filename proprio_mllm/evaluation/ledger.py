@@ -20,8 +20,6 @@ from configs.validate import ConfigError, build
 from data.files import parse_json
 from interface.episode import EpisodeRecord, Outcome
 
-__all__ = ["LEDGER_VERSION", "EpisodeKey", "Ledger", "LedgerError", "key_of", "read_ledger", "scored"]
-
 LEDGER_VERSION: Final = 3
 #: Fields that lines of older versions lack; the record's own defaults stand in.
 _SINCE_3: Final = frozenset({"in_time", "stuck"})

@@ -50,8 +50,6 @@ from sim.scene.catalogue import load_catalogue
 from sim.tasks.instructions import ORDINALS, TEMPLATES, natural_name, plural
 from sim.tasks.sample import TRAIN_ROOMS, rng_for
 
-__all__ = ["Lessons", "WordsOnly"]
-
 _MAX_STEPS: Final = 40
 _RENAMED: Final = 0.5
 _MOST_RENAMED: Final = 5

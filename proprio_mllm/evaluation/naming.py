@@ -14,8 +14,6 @@ from configs.schema.backend import BackendConfig
 from configs.schema.checks import defaults_of
 from configs.schema.eval import EvalConfig, PlannerConfig
 
-__all__ = ["as_published", "options_of"]
-
 #: Of a planner's fields, those that say who plans rather than how, and `reflection`, which tables have columns for.
 _WHO: Final = frozenset({"weights", "source", "adapter", "train", "memory", "reflection"})
 _ASKED: Final = ("temperature", "max_tokens", "image_size")

@@ -22,8 +22,6 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from data.workers import start_worker
 
-__all__ = ["Worker", "run_here", "run_jobs"]
-
 logger = logging.getLogger(__name__)
 
 J = TypeVar("J")

@@ -13,8 +13,6 @@ from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 from sim.expert.expert import Expert
 from sim.session.session import Session
 
-__all__ = ["ExpertPlanner", "PrivilegedPlanner"]
-
 
 @runtime_checkable
 class PrivilegedPlanner(Protocol):

@@ -21,8 +21,6 @@ from proprio_mllm.evaluation.asking import AskingPlanner, ModelDesk, batch_plann
 from proprio_mllm.evaluation.pool import Worker
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
 
-__all__ = ["RayServer", "ray_model", "run_ray_jobs"]
-
 logger = logging.getLogger(__name__)
 
 J = TypeVar("J")

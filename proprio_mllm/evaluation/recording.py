@@ -16,8 +16,6 @@ from proprio_mllm.planners.protocol import PlannerReply
 from proprio_mllm.training.rollouts import rollout_row
 from sim.tasks.task import Task
 
-__all__ = ["RolloutRecorder"]
-
 
 class RolloutRecorder:
     """Collects one episode; `watch` is given to the episode runner."""

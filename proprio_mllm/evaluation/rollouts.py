@@ -26,8 +26,6 @@ from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWor
 from proprio_mllm.training.rollouts import RolloutRequest
 from sim.tasks.task import Task
 
-__all__ = ["collect_rollouts", "training_tasks"]
-
 logger = logging.getLogger(__name__)
 
 _PER_PART: Final = 12

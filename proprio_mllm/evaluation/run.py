@@ -48,18 +48,6 @@ from sim.scene.compiler import PHYSICS
 from sim.session.contingency import load_contingency
 from sim.tasks.task import Task, load_benchmark, read_tasks
 
-__all__ = [
-    "RUN_VERSION",
-    "EvalRun",
-    "config_hash",
-    "evaluate",
-    "plan_episodes",
-    "run_folder",
-    "select_tasks",
-    "task_key",
-    "weights_digest",
-]
-
 logger = logging.getLogger(__name__)
 
 RUN_VERSION: Final = 1

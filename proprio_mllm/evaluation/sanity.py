@@ -22,8 +22,6 @@ from interface.episode import Outcome
 from proprio_mllm.evaluation.run import evaluate
 from sim.tasks.task import load_benchmark, write_tasks
 
-__all__ = ["PLANNERS", "Verdict", "sanity"]
-
 PLANNERS: Final = ("expert", "scripted", "words")
 _CATEGORIES: Final = ("single", "essential")
 

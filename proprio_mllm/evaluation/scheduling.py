@@ -17,8 +17,6 @@ from proprio_mllm.evaluation.ray_pool import ray_model, run_ray_jobs
 from proprio_mllm.evaluation.serving import model_process
 from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWorker, Opener, WorkerSetup, lost_episode
 
-__all__ = ["scheduled"]
-
 
 def scheduled(
     cfg: EvalConfig,

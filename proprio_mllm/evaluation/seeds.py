@@ -9,8 +9,6 @@ import hashlib
 
 import numpy as np
 
-__all__ = ["episode_seed", "stream"]
-
 
 def episode_seed(seed: int, task: str, robot: str, trial: int) -> int:
     """Seed of an episode in [0, 2^31)."""

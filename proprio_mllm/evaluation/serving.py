@@ -33,8 +33,6 @@ from interface.observation import Observation
 from proprio_mllm.evaluation.asking import AskingPlanner, ModelDesk, batch_planner
 from proprio_mllm.planners.protocol import Planner, PlannerReply, TaskInfo
 
-__all__ = ["ModelProcess", "SocketServer", "model_process"]
-
 logger = logging.getLogger(__name__)
 
 #: A model has to be read and its process started within this time.

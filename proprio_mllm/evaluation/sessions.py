@@ -18,8 +18,6 @@ from sim.session.session import Session
 from sim.tasks.task import Task
 from sim.world.facts import world_facts
 
-__all__ = ["SimSession", "open_session"]
-
 _sessions: dict[tuple[RobotConfig, str, int, str, int], Session] = {}
 
 

@@ -20,8 +20,6 @@ from interface.failures import FAILED
 from interface.feedback import ActionOutcome, Feedback
 from interface.observation import HistoryItem, Observation, Proprioception
 
-__all__ = ["Showing", "grey"]
-
 _GREY = 128
 
 

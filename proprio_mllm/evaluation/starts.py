@@ -20,8 +20,6 @@ from sim.skills.obstacles import navigation_map
 from sim.tasks.task import Start, Task
 from sim.world.world import World, WorldError
 
-__all__ = ["random_start", "started"]
-
 #: Free distance around the robot's disc at a random start, metres; as for the benchmark's own starts.
 CLEARANCE_M: Final = 0.05
 _YAW_STEP_DEG: Final = 5.0

@@ -12,8 +12,6 @@ from sim.play.live import LiveView
 from sim.session.session import Session
 from sim.world.world import World
 
-__all__ = ["Watching"]
-
 #: Simulated seconds per second.
 _SPEED = 2.0
 

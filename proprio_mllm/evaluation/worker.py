@@ -40,17 +40,6 @@ from sim.tasks.task import Task
 if TYPE_CHECKING:
     from proprio_mllm.evaluation.recording import RolloutRecorder
 
-__all__ = [
-    "EpisodeJob",
-    "EpisodeResult",
-    "EpisodeWorker",
-    "Opener",
-    "PlannerServer",
-    "WorkerSetup",
-    "lost_episode",
-    "open_simulator",
-]
-
 #: Calls in a row that do not reach a server which has answered before, each with its repetitions, until the run stops.
 _MOST_UNREACHED: Final = 5
 

@@ -7,8 +7,6 @@ from transformers import Qwen2_5_VLConfig
 from configs.schema.model import ModelConfig
 from proprio_mllm.model.processor import ProprioProcessor
 
-__all__ = ["backbone_config"]
-
 
 def backbone_config(cfg: ModelConfig, processor: ProprioProcessor) -> Qwen2_5_VLConfig:
     """Configuration of a backbone from scratch; every token id comes from the tokenizer."""

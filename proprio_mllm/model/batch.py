@@ -30,8 +30,6 @@ from proprio_mllm.model.mpe import Centroid, position_ids
 from proprio_mllm.model.processor import ProprioProcessor
 from proprio_mllm.model.vocabulary import MOTION_END, MOTION_START
 
-__all__ = ["Batch", "Collator", "Example", "ImageBatch", "Movable", "View"]
-
 IGNORE = -100
 
 

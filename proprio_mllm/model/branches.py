@@ -28,8 +28,6 @@ from transformers.modeling_utils import ALL_ATTENTION_FUNCTIONS
 
 from proprio_mllm.model.batch import Movable
 
-__all__ = ["Branches", "read_branches"]
-
 _NAME: Final = "branches"
 _LINE: Final = 256
 

@@ -43,20 +43,6 @@ from proprio_mllm.model.tensors import check_files, file_hashes, read_tensors, w
 from proprio_mllm.model.tokenizer import train_tokenizer
 from proprio_mllm.model.vocabulary import add_motion_tokens
 
-__all__ = [
-    "add_adapter",
-    "build_model",
-    "build_point_map",
-    "build_processor",
-    "load_model",
-    "load_motion",
-    "merge_adapter",
-    "save_model",
-    "share_backbone",
-    "use_adapter",
-    "write_stored",
-]
-
 _FORMAT = 2
 _WEIGHTS, _HEADS = "model.safetensors", "heads.safetensors"
 LORA_TARGETS = r".*language_model\.layers\..*(q|k|v|o|gate|up|down)_proj"

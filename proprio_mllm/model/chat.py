@@ -13,8 +13,6 @@ from typing import Literal
 
 from transformers import PreTrainedTokenizerBase
 
-__all__ = ["IMAGE", "Encoded", "Message", "encode", "render", "to_chat"]
-
 IMAGE = "<|vision_start|><|image_pad|><|vision_end|>"
 Role = Literal["system", "user", "assistant"]
 

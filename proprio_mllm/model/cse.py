@@ -17,8 +17,6 @@ from torch.nn import functional
 from configs.schema.model import CseConfig
 from proprio_mllm.model.point_map import GeoFeatures
 
-__all__ = ["CrossSpatialEncoder"]
-
 #: Points beyond this are held to it, metres.
 FAR_M = 10.0
 

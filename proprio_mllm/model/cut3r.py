@@ -32,8 +32,6 @@ from configs.schema.model import PointMapConfig
 from data.files import file_hash
 from proprio_mllm.model.point_map import GeoFeatures
 
-__all__ = ["CUT3R_512", "Cut3rPointMap", "FloatRope2d", "read_checkpoint"]
-
 #: Sizes of the released 512-pixel DPT model, as in its training configuration.
 CUT3R_512: Mapping[str, Any] = {
     "freeze": "none",

@@ -20,8 +20,6 @@ from torch.nn import functional
 from proprio_mllm.model.batch import Movable
 from proprio_mllm.model.modeling import ProprioMLLM
 
-__all__ = ["DenseHead", "DenseLoss", "DenseTargets", "dense_targets"]
-
 
 @dataclass(frozen=True, slots=True)
 class DenseTargets(Movable):

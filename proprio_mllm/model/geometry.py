@@ -23,8 +23,6 @@ from configs.schema.model import CentroidName
 from interface.bodies import KEY_BODIES
 from interface.observation import Camera
 
-__all__ = ["arm_length_m", "body_point_in_pelvis", "centroid", "project", "unproject"]
-
 _INDEX = {name: i for i, name in enumerate(KEY_BODIES)}
 _ARMS = [_INDEX[f"{side}_{part}"] for side in ("left", "right") for part in ("elbow", "hand")]
 #: A point behind the camera is projected from this depth, metres: far outside the image on the side where it is.

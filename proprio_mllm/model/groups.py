@@ -22,8 +22,6 @@ from torch import nn
 
 from proprio_mllm.model.modeling import ProprioMLLM
 
-__all__ = ["GROUPS", "adapter_of", "group_of", "parameter_groups", "train_only"]
-
 GROUPS: tuple[str, ...] = ("rows", "lora", "lm", "vision", "merger", "cse", "mpe", "point_map")
 _ADAPTER = re.compile(r"\.(?:lora_[AB]|trainable_tokens_delta)\.([^.]+)")
 

@@ -26,8 +26,6 @@ from proprio_mllm.model.cse import CrossSpatialEncoder
 from proprio_mllm.model.mpe import SignEmbedding
 from proprio_mllm.model.processor import ProprioProcessor
 
-__all__ = ["ModelOutput", "ProprioMLLM"]
-
 
 @dataclass(frozen=True, slots=True)
 class ModelOutput:

@@ -32,8 +32,6 @@ from data.files import read_json, write_text
 from proprio_mllm.model.quantizer import MotionQuantizer
 from proprio_mllm.model.tensors import read_tensors, write_tensors
 
-__all__ = ["MotionTokenizer", "TokenizerLoss"]
-
 _FORMAT = 2
 
 

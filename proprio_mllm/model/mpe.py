@@ -37,8 +37,6 @@ from torch import Tensor, nn
 
 from configs.schema.model import MpeMode
 
-__all__ = ["MPE_MODES", "SignEmbedding", "degenerate", "position_ids", "relative_cells", "visual_positions"]
-
 MPE_MODES: tuple[MpeMode, ...] = ("mrope", "rope_sign", "rope_sign_raw", "rope_radial", "embed_sign", "rope_sign+embed")
 Centroid = tuple[float, float]
 #: Share of a cell within which a token is level with the robot.

@@ -19,8 +19,6 @@ from proprio_mllm.model.vocabulary import motion_text
 from proprio_mllm.model.word_tokens import Tokens, opening
 from proprio_mllm.model.wording import log_words, prefix_words, state_words
 
-__all__ = ["EpisodeLog", "motion_codes", "pictured_turn", "turn_example", "view_of"]
-
 
 @dataclass(slots=True)
 class EpisodeLog:

@@ -16,8 +16,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["GeoFeatures", "OraclePointMap", "PointMapEncoder", "SimPointMap", "point_map_loss"]
-
 
 @dataclass(frozen=True, slots=True)
 class GeoFeatures:

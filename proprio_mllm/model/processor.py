@@ -14,8 +14,6 @@ from transformers.models.qwen2_5_vl.processing_qwen2_5_vl import Qwen2_5_VLProce
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 from transformers.processing_utils import ProcessorMixin
 
-__all__ = ["CHAT_TEMPLATE", "DEFAULT_SYSTEM", "ProprioProcessor", "make_processor"]
-
 DEFAULT_SYSTEM = "You are a helpful assistant."
 #: ChatML as Qwen2.5-VL writes it: a default system line, images as one pad between the vision delimiters.
 CHAT_TEMPLATE = (

@@ -16,20 +16,6 @@ from interface.observation import HistoryItem
 from proprio_mllm.model.chat import Message
 from proprio_mllm.model.vocabulary import motion_text
 
-__all__ = [
-    "Style",
-    "answers",
-    "body_state_prompt",
-    "critic_prompt",
-    "described_motion",
-    "filled_motion",
-    "last_steps",
-    "looking",
-    "made_motion",
-    "self_ask_prompt",
-    "with_answer",
-]
-
 Style = Literal["terse", "full"]
 
 _SYSTEM: dict[str, dict[Style, str]] = {

@@ -24,8 +24,6 @@ from vector_quantize_pytorch import FSQ, ResidualVQ, VectorQuantize
 
 from configs.schema.model import MotionTokenizerConfig
 
-__all__ = ["MotionQuantizer", "Quantised"]
-
 
 @dataclass(frozen=True, slots=True)
 class Quantised:

@@ -20,8 +20,6 @@ from interface.steps import Action
 from proprio_mllm.model.geometry import arm_length_m
 from proprio_mllm.model.prompts import Style
 
-__all__ = ["QUESTIONS", "arm_answer", "ask", "body_shift_m", "distance_answer", "height_answer", "shift_answer", "side_answer"]
-
 #: Bearing within which an object counts as ahead, degrees.
 AHEAD_DEG = 8.0
 #: Limits of near and far, metres in the floor plane from the pelvis.

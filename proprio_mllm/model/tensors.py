@@ -14,8 +14,6 @@ from torch import Tensor
 
 from data.files import DamagedFileError, file_hash
 
-__all__ = ["check_files", "file_hashes", "read_tensors", "write_tensors"]
-
 
 def write_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
     """Writes a safetensors file.

@@ -17,8 +17,6 @@ from transformers.models.qwen2.tokenization_qwen2 import PRETOKENIZE_REGEX
 
 from interface.actions import ACTIONS
 
-__all__ = ["ID_SUFFIXES", "SPECIAL_TOKENS", "train_tokenizer"]
-
 #: Qwen's special tokens, in its order.
 SPECIAL_TOKENS: tuple[str, ...] = (
     "<|endoftext|>",

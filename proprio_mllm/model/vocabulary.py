@@ -12,8 +12,6 @@ from collections.abc import Iterable, Sequence
 
 from transformers import AddedToken, PreTrainedTokenizerBase
 
-__all__ = ["MOTION_END", "MOTION_MASK", "MOTION_START", "add_motion_tokens", "motion_text", "motion_tokens", "parse_motion"]
-
 MOTION_START = "<motion_start>"
 MOTION_END = "<motion_end>"
 MOTION_MASK = "<motion_mask>"

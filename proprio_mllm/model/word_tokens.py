@@ -17,18 +17,6 @@ from transformers import AddedToken
 
 from proprio_mllm.model.wording import END
 
-__all__ = [
-    "SLOTS",
-    "EnglishTokens",
-    "Tokens",
-    "WordTokens",
-    "add_word_tokens",
-    "first_word",
-    "known_words",
-    "opening",
-    "tokens_of",
-]
-
 #: Different unknown words of an episode.
 SLOTS: Final = 16
 _SLOT: Final = tuple(f" <word_{number}>" for number in range(SLOTS))

@@ -30,23 +30,6 @@ from interface.sightings import Seen, Sightings
 from interface.steps import Action, PlanStep
 from interface.symbolic import events_of
 
-__all__ = [
-    "END",
-    "ID_NUMBERS",
-    "MARKERS",
-    "WordEpisode",
-    "WordTurn",
-    "Words",
-    "answer_words",
-    "id_words",
-    "log_words",
-    "number_words",
-    "prefix_words",
-    "read_step",
-    "state_words",
-    "text_words",
-]
-
 Words = tuple[str, ...]
 
 #: Ends an answer.

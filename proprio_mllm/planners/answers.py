@@ -18,8 +18,6 @@ from proprio_mllm.model.wording import END, id_words, number_words
 from proprio_mllm.planners.furniture import CONTAINERS, FIXTURES, SEATS, SURFACES
 from proprio_mllm.planners.scripted.words import type_of
 
-__all__ = ["AnswerGrammar"]
-
 #: Verbs whose object is never furniture.
 _OF_MOVABLES: Final = frozenset(("Pick", "Lift", "Slice", "Pour", "UseUp"))
 

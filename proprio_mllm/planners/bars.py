@@ -7,8 +7,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-__all__ = ["without_bar"]
-
 
 @contextlib.contextmanager
 def without_bar() -> Iterator[None]:

@@ -11,8 +11,6 @@ from __future__ import annotations
 from data.code_files import CodeFileError, load_named
 from proprio_mllm.planners.protocol import Planner
 
-__all__ = ["load_planner"]
-
 
 def load_planner(source: str, *given: object) -> Planner:
     """A new planner of a file's class. The file's folder can be imported from, as when Python runs a script.

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = ["CONTAINERS", "FIXTURES", "SEATS", "SURFACES"]
-
 #: Where things usually are, in groups of decreasing likelihood.
 SURFACES: Final = ("countertop", "diningtable", "coffeetable", "sidetable", "desk", "shelf", "dresser", "tvstand")
 SEATS: Final = ("sofa", "bed", "chair", "stoveburner", "sinkbasin", "bathtubbasin", "toilet", "garbagecan")

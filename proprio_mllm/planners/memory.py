@@ -26,21 +26,6 @@ from interface.observation import HistoryItem
 from interface.steps import PlanStep
 from proprio_mllm.planners.protocol import succeeded
 
-__all__ = [
-    "IMAGES_FILE",
-    "MEMORY_FILE",
-    "SCHEMA_VERSION",
-    "Features",
-    "Memory",
-    "MemoryEpisode",
-    "MemoryFileError",
-    "MemoryHeader",
-    "MemoryStep",
-    "check_memory",
-    "plan_of",
-    "read_memory",
-]
-
 T = TypeVar("T")
 SCHEMA_VERSION: Final = 1
 #: Names of the files in a memory's folder.

@@ -44,8 +44,6 @@ from proprio_mllm.planners.memory import (
 from proprio_mllm.planners.protocol import succeeded
 from proprio_mllm.training.sources import shard_hash
 
-__all__ = ["Candidate", "MemoryConfig", "build_memory", "candidates", "main", "select"]
-
 #: Columns that an episode is made of, without its pictures and motions.
 _COLUMNS: Final = (
     "episode", "task", "split", "category", "robot", "room", "instruction", "visible", "known", "history", "target",

@@ -21,20 +21,6 @@ from interface.observation import HistoryItem, Observation
 from interface.sightings import Seen
 from interface.steps import ActionError, PlanStep
 
-__all__ = [
-    "ONE_CALL",
-    "BatchPlanner",
-    "Planner",
-    "PlannerReply",
-    "TaskInfo",
-    "Usage",
-    "WeightsError",
-    "check_weights",
-    "parse_reply",
-    "succeeded",
-    "without_failures",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class TaskInfo:

@@ -18,8 +18,6 @@ from interface.observation import Observation
 from interface.steps import Action, PlanStep
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 
-__all__ = ["RandomPlanner"]
-
 
 class RandomPlanner:
     """Draws legal actions.

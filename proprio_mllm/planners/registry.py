@@ -21,8 +21,6 @@ from proprio_mllm.planners.protocol import Planner
 from proprio_mllm.planners.random_planner import RandomPlanner
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 
-__all__ = ["CHAT_PLANNERS", "PLANNERS", "make_chat_planner", "make_planner"]
-
 
 def _mllm(cfg: PlannerConfig) -> Planner:
     from proprio_mllm.planners.words import WordsPlanner  # torch loads only where a model is used

@@ -43,8 +43,6 @@ from proprio_mllm.model.wording import Words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights, without_failures
 
-__all__ = ["WordsPlanner", "WordsState"]
-
 #: Refusals of a step from one stance after which another one is taken.
 _REFUSALS: Final = 2
 _CHOICES: Final = 4

@@ -57,8 +57,6 @@ from sim.collection.collect import collect
 from sim.scene.rooms import room_names
 from sim.tasks.sample import TRAIN_ROOMS
 
-__all__ = ["BodyQaConfig", "Question", "Score", "main", "questions_of", "scores"]
-
 _ABOUT_THINGS: Final = ("side", "distance", "height", "arm")
 _ABOUT_SELF: Final = ("hands", "pelvis")
 _KINDS: Final = (*_ABOUT_THINGS, *_ABOUT_SELF)

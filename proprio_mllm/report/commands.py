@@ -19,10 +19,9 @@ from configs.arguments import dispatch, read_named
 from configs.schema.checks import require
 from data.files import write_text
 from proprio_mllm.report.comparison import RunComparison, compare_bodies, compare_runs, comparison_table
-from proprio_mllm.report.runs import Run, load_run, write_report
+from proprio_mllm.report.runs import write_report
+from proprio_mllm.report.stored import Run, load_run
 from proprio_mllm.report.table import Table
-
-__all__ = ["COMMANDS", "main"]
 
 _HERE: Final = "proprio_mllm.report.commands"
 COMMANDS: Final = {

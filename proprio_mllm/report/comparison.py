@@ -23,8 +23,6 @@ from proprio_mllm.report.stored import Run
 from proprio_mllm.report.summary import CATEGORIES
 from proprio_mllm.report.table import Table
 
-__all__ = ["RunComparison", "compare_bodies", "compare_runs", "comparison_table"]
-
 Pair = tuple[EpisodeRecord, EpisodeRecord]
 
 _FIGURES: Final[Mapping[str, Callable[[EpisodeRecord], float]]] = {

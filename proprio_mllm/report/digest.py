@@ -12,13 +12,12 @@ from typing import Any, Final
 
 from data.files import file_hash
 from interface.episode import EpisodeRecord, Outcome
-from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, Deciding, deciding_failure, unmet_objects
+from interface.failures import INVALID_OUTPUT
+from proprio_mllm.evaluation.attribution import Deciding, deciding_failure, unmet_objects
 from proprio_mllm.report.frames import ActedOut, episode_id
-from proprio_mllm.report.runs import Run
+from proprio_mllm.report.stored import Run
 from proprio_mllm.report.words import code_in_words, margins_in_words
 from sim.tasks.task import Task
-
-__all__ = ["episode_digest", "run_digest"]
 
 #: Fields of a record that are shown as they are.
 _FIELDS: Final = (

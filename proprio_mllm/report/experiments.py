@@ -15,10 +15,9 @@ from configs.schema.eval import CHAT_KINDS, ExperimentConfig
 from data.files import write_text
 from proprio_mllm.report.figures import distribution_figures, failure_figure
 from proprio_mllm.report.paper import PAPER_ROWS, paper_ablation, paper_main, paper_replanning
-from proprio_mllm.report.runs import Run, find_runs, newest
+from proprio_mllm.report.runs import newest
+from proprio_mllm.report.stored import Run, find_runs
 from proprio_mllm.report.table import Table, in_time_cell, rate_cell
-
-__all__ = ["EXPERIMENTS", "ablation_table", "assemble", "main_table", "replanning_table"]
 
 _CATEGORIES: Final = ("essential", "optional", "single")
 _PAPER_NOTE: Final = "paper: printed in the paper, another simulator and a 7B model; not comparable in size, shown apart."

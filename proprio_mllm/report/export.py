@@ -28,10 +28,8 @@ from proprio_mllm.report.digest import run_digest
 from proprio_mllm.report.frames import ActedOut
 from proprio_mllm.report.html import FrameChoice, run_data
 from proprio_mllm.report.reenact import Episode, RunTasks, TaskGoneError
-from proprio_mllm.report.runs import Run, load_run
 from proprio_mllm.report.sft import RowChoice, sft_features, sft_rows
-
-__all__ = ["EXPORT_VERSION", "ExportConfig", "ExportError", "export", "main", "read_sft", "read_traces"]
+from proprio_mllm.report.stored import Run, load_run
 
 logger = logging.getLogger(__name__)
 

@@ -21,11 +21,10 @@ from matplotlib.ticker import MaxNLocator
 
 from configs.schema.eval import ExperimentConfig
 from interface.episode import Outcome
-from proprio_mllm.report.runs import Run, newest
+from proprio_mllm.report.runs import newest
+from proprio_mllm.report.stored import Run
 from proprio_mllm.report.summary import Row
 from sim.tasks.task import Task, load_benchmark, tasks_text
-
-__all__ = ["distribution_figures", "failure_figure", "plot_failures", "plot_success", "task_distribution"]
 
 _COLOURS = {"navigation": "#4477aa", "body_adjustment": "#ee8866", "logical": "#bbbbbb"}
 _GREEN = "#228833"

@@ -30,8 +30,6 @@ from proprio_mllm.evaluation.ledger import to_json
 from proprio_mllm.evaluation.pool import run_jobs
 from proprio_mllm.report.reenact import Episode, Reenactment
 
-__all__ = ["FRAMES_VERSION", "ActedOut", "act_out", "encode_jpeg", "episode_id"]
-
 logger = logging.getLogger(__name__)
 
 FRAMES_VERSION: Final = 1

@@ -30,10 +30,9 @@ from proprio_mllm.report.digest import episode_digest, run_digest
 from proprio_mllm.report.frames import ActedOut, act_out, episode_id
 from proprio_mllm.report.reenact import Episode, RunTasks, TaskGoneError
 from proprio_mllm.report.references import references_of
-from proprio_mllm.report.runs import Run, load_run, run_notes
+from proprio_mllm.report.runs import run_notes
+from proprio_mllm.report.stored import Run, load_run
 from proprio_mllm.report.summary import Row
-
-__all__ = ["HtmlConfig", "RunData", "main", "page", "run_data"]
 
 logger = logging.getLogger(__name__)
 

@@ -32,8 +32,6 @@ from interface.failures import FailureCode
 from interface.steps import Action, ActionError
 from proprio_mllm.report.statistics import cluster_bootstrap
 
-__all__ = ["Certificate", "Extras", "References", "extras_of", "first_tries", "path_efficiency", "recoveries"]
-
 SHORTEST_M: Final = 0.1
 Reach = Literal["reached", "stance", "height", "arm"]
 _OUT_OF_REACH: Final[Mapping[str, Reach]] = {

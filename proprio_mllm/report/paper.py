@@ -13,8 +13,6 @@ import yaml
 
 from interface.bodies import PAPER_ROBOTS
 
-__all__ = ["PAPER_ROWS", "paper_ablation", "paper_main", "paper_replanning"]
-
 #: Rows of the paper's tables that stand beside a planner of ours: planner name to (Table II, Table III, Table IV).
 PAPER_ROWS: Final[Mapping[str, tuple[str | None, str | None, str | None]]] = {
     "proprio": ("Proprio-MLLM", "Proprio-MLLM", "Proprio-MLLM"),

@@ -18,8 +18,6 @@ from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.reconstruction import chosen_pairs, draw_reconstruction
 from proprio_mllm.training.sources import Clips
 
-__all__ = ["main"]
-
 
 @dataclass(frozen=True)
 class PictureConfig:

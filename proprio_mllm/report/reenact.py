@@ -16,19 +16,17 @@ from pathlib import Path
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.validate import build
 from interface.episode import EpisodeRecord
+from interface.failures import INVALID_OUTPUT
 from interface.feedback import Feedback
 from interface.observation import HistoryItem, Observation
 from interface.steps import PlanStep
-from proprio_mllm.evaluation.attribution import INVALID_OUTPUT
 from proprio_mllm.evaluation.episode import Limits
 from proprio_mllm.evaluation.run import plan_episodes, select_tasks
 from proprio_mllm.evaluation.seeds import episode_seed
 from proprio_mllm.evaluation.starts import started
-from proprio_mllm.report.runs import Run
+from proprio_mllm.report.stored import Run
 from sim.session.session import Session
 from sim.tasks.task import Task
-
-__all__ = ["Episode", "Moment", "Reenactment", "RunTasks", "TaskGoneError", "find_record"]
 
 
 class TaskGoneError(ValueError):

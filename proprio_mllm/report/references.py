@@ -21,8 +21,6 @@ from proprio_mllm.report.metrics import Certificate, References
 from proprio_mllm.report.stored import Run, load_run, read_metadata
 from sim.tasks.task import load_benchmark
 
-__all__ = ["read_certificates", "references_of"]
-
 CERTIFICATES_PATH: Final = Path(sim.tasks.__file__).parent / "certificates.jsonl"
 
 logger = logging.getLogger(__name__)

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from configs.arguments import read_named
-from proprio_mllm.evaluation.attribution import INVALID_OUTPUT
+from interface.failures import INVALID_OUTPUT
 from proprio_mllm.report.reenact import Episode, Reenactment, RunTasks, find_record
-from proprio_mllm.report.runs import load_run
+from proprio_mllm.report.stored import load_run
 from sim.play.live import LiveView
-
-__all__ = ["ReplayConfig", "main", "replay"]
 
 #: Letters of a reply.
 _SHOWN = 80

@@ -13,11 +13,9 @@ from proprio_mllm.backends.protocol import BackendError
 from proprio_mllm.backends.spending import Spending
 from proprio_mllm.evaluation.naming import as_published
 from proprio_mllm.report.references import references_of
-from proprio_mllm.report.stored import Run, find_runs, load_run
+from proprio_mllm.report.stored import Run
 from proprio_mllm.report.summary import SUMMARY_VERSION, Row, write_json
 from proprio_mllm.report.table import Table, run_table
-
-__all__ = ["Run", "find_runs", "load_run", "newest", "run_notes", "run_report", "write_report"]
 
 
 def run_notes(run: Run) -> list[str]:

@@ -32,8 +32,6 @@ from proprio_mllm.model.prompts import answers, last_steps, with_answer
 from proprio_mllm.report.frames import episode_id
 from proprio_mllm.report.reenact import Episode, Moment, Reenactment
 
-__all__ = ["PROPRIOCEPTION_COLUMNS", "SFT_COLUMNS", "RowChoice", "plan_prompt", "sft_features", "sft_rows"]
-
 logger = logging.getLogger(__name__)
 
 _TEXT, _INT, _FLOAT, _BOOL = (datasets.Value(name) for name in ("string", "int64", "float32", "bool"))

@@ -15,8 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-__all__ = ["Comparison", "Interval", "cluster_bootstrap", "compare", "rate_interval", "wilson"]
-
 _DRAWS = 4000
 
 

@@ -16,8 +16,6 @@ from proprio_mllm.evaluation.naming import options_of
 from proprio_mllm.report.metrics import References
 from proprio_mllm.report.summary import CATEGORIES, Row, rows_of
 
-__all__ = ["Run", "find_runs", "load_run", "read_metadata"]
-
 #: Faults of a file that a message names.
 _TOLD: Final = 5
 

@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 
 from configs.arguments import read_named
 from proprio_mllm.report.reenact import Reenactment, RunTasks, find_record
-from proprio_mllm.report.runs import Run, load_run
-
-__all__ = ["Frame", "draw_strip", "main", "replay"]
+from proprio_mllm.report.stored import Run, load_run
 
 logger = logging.getLogger(__name__)
 

@@ -41,8 +41,6 @@ from interface.failures import FailureCategory
 from proprio_mllm.report.metrics import Extras, References, extras_of
 from proprio_mllm.report.statistics import rate_interval
 
-__all__ = ["CATEGORIES", "SUMMARY_VERSION", "Row", "by_task", "rows_of", "write_json"]
-
 SUMMARY_VERSION: Final = 2
 #: Order of rows in every table.
 CATEGORIES: Final = ("single", "optional", "essential")

@@ -15,8 +15,6 @@ from rich.table import Table as RichTable
 
 from proprio_mllm.report.summary import Row
 
-__all__ = ["Table", "in_time_cell", "latex_text", "rate_cell", "run_table"]
-
 _LATEX: Final = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",

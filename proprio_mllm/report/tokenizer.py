@@ -36,8 +36,6 @@ from proprio_mllm.training.reconstruction import draw_use
 from proprio_mllm.training.sources import Clips
 from robots.spec import available_robots, load_robot
 
-__all__ = ["Options", "Row", "evaluate_tokenizer", "main", "real_windows", "table", "windows_of"]
-
 _HEADINGS: Final = (
     "tokenizer", "codes", "bits/s", "clips", "MPJPE mm", "hands mm", "feet mm", "velocity mm/s", "joints °", "used %",
     "perplexity", "ms",

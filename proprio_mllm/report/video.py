@@ -14,12 +14,10 @@ from pathlib import Path
 from typing import Final
 
 from configs.arguments import read_named
-from proprio_mllm.evaluation.attribution import INVALID_OUTPUT
+from interface.failures import INVALID_OUTPUT
 from proprio_mllm.report.reenact import Episode, Reenactment, RunTasks, find_record
-from proprio_mllm.report.runs import load_run
+from proprio_mllm.report.stored import load_run
 from sim.tools.video import VideoRecorder, check_film
-
-__all__ = ["VideoConfig", "film", "main"]
 
 logger = logging.getLogger(__name__)
 

@@ -10,8 +10,6 @@ from typing import Final
 
 from interface.failures import FAILURES, FailureCode
 
-__all__ = ["code_in_words", "margins_in_words"]
-
 
 def code_in_words(code: str) -> str:
     """What a failure code means; a code that the simulator does not have stands for itself."""

@@ -41,15 +41,6 @@ from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordBatch, WordsObjective
 
-__all__ = [
-    "PHASES",
-    "AlignmentData",
-    "AlignmentObjective",
-    "Phase",
-    "body_state",
-    "body_state_accuracy",
-]
-
 Kind = Literal["say", "feel", "do", "fill", "say_image", "body", "plan", "text"]
 
 

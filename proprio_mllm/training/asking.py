@@ -11,8 +11,6 @@ import torch
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.modeling import ProprioMLLM
 
-__all__ = ["LONGEST_STEP", "answer_shares", "replies"]
-
 _BATCH: Final = 16
 #: Tokens of the longest planning step.
 LONGEST_STEP: Final = 40

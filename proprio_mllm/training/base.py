@@ -29,8 +29,6 @@ from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordBatch, WordsObjective
 
-__all__ = ["DenseObjective", "JointObjective", "grounding_accuracy"]
-
 #: Decisions that take as long as an episode in words.
 EPISODE_ROWS: Final = 4
 #: Share of phrases among the judging questions.

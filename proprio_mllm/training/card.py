@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-__all__ = ["model_card"]
-
 _ABOUT: Final = {
     "practice": "A language model from scratch that plans in words: it reads the episode so far and answers with a plan step.",
     "base": "The language model of `words` that has learnt to see; it stands in for a pretrained Qwen2.5-VL at this size.",

@@ -14,8 +14,6 @@ from torch import Tensor, nn
 from data.files import new_folder, read_json
 from proprio_mllm.model.tensors import check_files, file_hashes, read_tensors, write_tensors
 
-__all__ = ["load_checkpoint", "save_checkpoint"]
-
 
 def save_checkpoint(
     folder: Path, step: int, module: nn.Module, optimizer: torch.optim.Optimizer, key: str, seconds: float = 0.0

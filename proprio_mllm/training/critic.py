@@ -30,19 +30,6 @@ from proprio_mllm.training.goals import Relabel, relabel, verbs_of
 from proprio_mllm.training.judging import LOG_LENGTH
 from proprio_mllm.training.rollouts import Rollout
 
-__all__ = [
-    "CriticExample",
-    "Judge",
-    "Kept",
-    "ModelJudge",
-    "OracleJudge",
-    "Trajectory",
-    "actor_examples",
-    "audit",
-    "critic_examples",
-    "keep",
-]
-
 Motion = Sequence[int] | None
 
 

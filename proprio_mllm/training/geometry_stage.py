@@ -15,8 +15,6 @@ from torch import Tensor, nn
 from proprio_mllm.model.point_map import point_map_loss
 from proprio_mllm.training.sources import Views
 
-__all__ = ["PointMapObjective", "point_map_error"]
-
 
 class PointMapObjective:
     """Confidence-weighted point regression on views."""

@@ -12,8 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["VERBS", "Relabel", "Verb", "natural_name", "parse_ids", "relabel", "type_words", "verbs_of"]
-
 _OBJECT_ID = re.compile(r"^[A-Za-z][A-Za-z0-9]{0,39}_[1-9][0-9]?$")
 _WORDS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|[0-9]+")
 _ENCLOSING: Final = frozenset(

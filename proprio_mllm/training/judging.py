@@ -17,8 +17,6 @@ from proprio_mllm.model.prompts import answers, critic_prompt, self_ask_prompt, 
 from proprio_mllm.training.sources import Demos
 from proprio_mllm.training.states import asked_relation, history_of, states_from_log
 
-__all__ = ["LOG_LENGTH", "judge_example"]
-
 #: Earlier steps shown to a judge.
 LOG_LENGTH: Final = 8
 

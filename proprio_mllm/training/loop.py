@@ -27,8 +27,6 @@ from proprio_mllm.training.checkpoint import load_checkpoint, save_checkpoint
 from proprio_mllm.training.metrics import MetricWriter
 from proprio_mllm.training.muon import Muon, linear_weights
 
-__all__ = ["LoopResult", "Objective", "Parts", "learning_rate", "make_optimizer", "run_loop"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -12,8 +12,6 @@ from typing import Any
 from configs.schema.train import LoggerConfig
 from data.files import write_text
 
-__all__ = ["MetricWriter"]
-
 logger = logging.getLogger(__name__)
 
 

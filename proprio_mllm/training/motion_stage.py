@@ -25,18 +25,6 @@ from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.posture import in_other_postures
 from proprio_mllm.training.sources import Clips, held_out
 
-__all__ = [
-    "FEATURE_BIAS",
-    "VARIED",
-    "MotionObjective",
-    "MotionWindows",
-    "bits_per_s",
-    "codebook_use",
-    "perplexity",
-    "reconstruction_metrics",
-    "tokenizer_metrics",
-]
-
 #: Factor on each normalised feature (F,).
 FEATURE_BIAS = np.ones(N_FEATURES, dtype=np.float32)
 FEATURE_BIAS[PELVIS_HEIGHT] = 1.5

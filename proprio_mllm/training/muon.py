@@ -17,8 +17,6 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Muon", "linear_weights", "orthogonalised"]
-
 #: Quintic Newton-Schulz iteration: singular values go to about 1 in five steps.
 _QUINTIC: Final = (3.4445, -4.7750, 2.0315)
 _ITERATIONS: Final = 5

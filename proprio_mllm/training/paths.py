@@ -20,8 +20,6 @@ from configs.schema.train import TrainConfig
 from data.files import read_json, write_text
 from data.shards import config_hash
 
-__all__ = ["StagePaths", "finish", "finished_key", "stage_key"]
-
 _SHARED = ("words", "practice", "base", "pointmap", "tokenizer")
 
 

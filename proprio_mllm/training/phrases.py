@@ -14,8 +14,6 @@ from proprio_mllm.model.batch import Example
 from proprio_mllm.model.prompts import Style, body_state_prompt, described_motion
 from proprio_mllm.training.sources import Clips
 
-__all__ = ["body_state_words", "phrase"]
-
 #: Pelvis heights are said in multiples of this, metres.
 _HEIGHT_STEP_M: Final = 0.05
 _LOWEST_M, _HIGHEST_M = 0.3, 1.2

@@ -21,18 +21,6 @@ from proprio_mllm.training.metrics import MetricWriter
 from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_key
 from proprio_mllm.training.sources import shard_hash
 
-__all__ = [
-    "LessonSource",
-    "Metrics",
-    "Pipeline",
-    "Stage",
-    "StageError",
-    "base_model_config",
-    "loop_values",
-    "seeded",
-    "variant_model",
-]
-
 logger = logging.getLogger(__name__)
 
 Metrics = dict[str, float]

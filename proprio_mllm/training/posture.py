@@ -18,8 +18,6 @@ from scipy.spatial.transform import Rotation
 from data.motion import KEY_BODY_COUNT, PELVIS_HEIGHT, PLANAR_VELOCITY, YAW_RATE
 from interface.bodies import KEY_BODIES
 
-__all__ = ["in_other_postures"]
-
 Array = NDArray[np.float64]
 _INDEX: Final = {name: index for index, name in enumerate(KEY_BODIES)}
 _SIDES: Final = ("left", "right")

@@ -25,8 +25,6 @@ from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.motion_stage import codebook_use
 from proprio_mllm.training.sources import Clips
 
-__all__ = ["chosen_pairs", "draw_reconstruction", "draw_use", "film_reconstruction", "reconstruct", "render"]
-
 _CHAINS: Final = (
     ("head", "torso"),
     ("torso", "left_shoulder", "left_elbow", "left_hand"),

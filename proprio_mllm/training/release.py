@@ -30,8 +30,6 @@ from proprio_mllm.training.pipeline import Pipeline
 from proprio_mllm.training.sources import shard_hash
 from proprio_mllm.training.stages.selu import CRITIC
 
-__all__ = ["LARGEST_MB", "export", "find_model", "release_name"]
-
 #: Largest size of one released folder, megabytes.
 LARGEST_MB: Final = 30.0
 _MODELS: Final = ("practice", "base", "alignment", "selu")

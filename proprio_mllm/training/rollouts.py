@@ -25,8 +25,6 @@ from data.shards import ShardReader, decode_motion, decode_png, encode_png
 from interface.observation import Camera, HistoryItem, Observation
 from proprio_mllm.model.batch import View
 
-__all__ = ["DaggerRequest", "Moment", "Rollout", "RolloutCollector", "RolloutRequest", "read_rollouts", "rollout_row"]
-
 
 @dataclass(frozen=True, slots=True)
 class RolloutRequest:

@@ -30,8 +30,6 @@ from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, answers
 from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
 
-__all__ = ["Clips", "Demos", "Views", "grips_of", "held_out", "shard_hash"]
-
 #: One in this many views, episodes and clips is never trained on.
 HELD_OUT = 20
 GROUNDING = ("side", "distance", "height")

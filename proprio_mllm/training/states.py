@@ -11,8 +11,6 @@ from interface.effects import Condition
 from interface.observation import HistoryItem
 from interface.symbolic import SymbolicState, events_of
 
-__all__ = ["asked_relation", "history_of", "states_from_log"]
-
 #: States that are asked about, by the words for being in them and for not.
 _WORDS: Final[Mapping[Condition, tuple[str, str]]] = {
     Condition.OPEN: ("open", "closed"),

@@ -17,8 +17,6 @@ from proprio_mllm.training.goals import type_words
 from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
 
-__all__ = ["adopt", "corpus", "start_from_words", "whole_words"]
-
 
 def corpus(
     cfg: ModelConfig,

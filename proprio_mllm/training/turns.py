@@ -23,8 +23,6 @@ from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.sources import Demos
 from proprio_mllm.training.words import LONGEST_LOG
 
-__all__ = ["Turns", "turn_accuracy"]
-
 
 class Turns:
     """Decisions with pictures, by row of the demonstrations that they come from.

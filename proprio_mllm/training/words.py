@@ -24,18 +24,6 @@ from proprio_mllm.model.word_tokens import Tokens, first_word, tokens_of
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.loop import Parts
 
-__all__ = [
-    "LONGEST_LOG",
-    "Source",
-    "WordBatch",
-    "WordsObjective",
-    "collate",
-    "held_out_metrics",
-    "mixed",
-    "rows_of",
-    "words_loss",
-]
-
 #: The episode of a seed.
 Source = Callable[[int], WordEpisode]
 #: Decisions of a row, and rows that are computed together.

@@ -22,19 +22,6 @@ from sim.scene.compiler import PHYSICS
 from sim.tasks.families import family_of
 from sim.tasks.task import BENCHMARK_PATH, Task
 
-__all__ = [
-    "CERTIFICATES_PATH",
-    "Certificate",
-    "Refusal",
-    "certificates_table",
-    "certificates_text",
-    "certified",
-    "certify",
-    "load_certificates",
-    "one_armed_steps",
-    "time_limit_of",
-]
-
 CERTIFICATES_PATH: Final = BENCHMARK_PATH.with_name("certificates.jsonl")
 #: Steps beyond the family's typical number that a certified plan may take.
 _EXTRA_STEPS: Final = 6

@@ -42,8 +42,6 @@ from sim.tasks.sample import sample_task
 from sim.tasks.task import BENCHMARK_PATH, Task, load_benchmark, tasks_text, write_tasks
 from sim.world.world import WorldError
 
-__all__ = ["BenchmarkConfig", "main", "rebuild", "stale_note"]
-
 logger = logging.getLogger(__name__)
 
 _KEPT: Final = Path("outputs/tasks")

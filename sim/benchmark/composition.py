@@ -10,8 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["COMPOSITION", "Share"]
-
 _KITCHENS: Final = ("kitchen_1", "kitchen_2", "kitchen_3")
 _LIVING: Final = ("living_room_1", "living_room_2", "living_room_3")
 _BEDROOMS: Final = ("bedroom_1", "bedroom_2")

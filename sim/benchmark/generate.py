@@ -24,8 +24,6 @@ from sim.tasks.sample import BIG_TYPES, sample_task
 from sim.tasks.task import Task
 from sim.world.world import WorldError
 
-__all__ = ["Slot", "counts", "fill", "fits", "generate", "more_seeds", "moved", "named_types", "read_lines", "slots"]
-
 _SEEDS_PER_SLOT: Final = 200
 #: Seeds that a slot tries per task that it has to find.
 _TRIES: Final = 12

@@ -21,8 +21,6 @@ from sim.tasks.sample import sample_task
 from sim.tasks.task import Task
 from sim.world.world import WorldError
 
-__all__ = ["Solved", "drift", "refresh", "solve_again"]
-
 #: A task with its certificates, or why it is none any more.
 Solved = tuple[Task, tuple[Certificate, ...]] | str
 #: Steps by which a plan may differ between two processors or versions of the physics: of both arms, of one.

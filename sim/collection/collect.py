@@ -25,8 +25,6 @@ from configs.schema.collect import CollectConfig
 from data.shards import Manifest, ShardWriter, config_hash
 from data.workers import worker_pool
 
-__all__ = ["collect", "main", "parts_of", "rows_of_part"]
-
 _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.

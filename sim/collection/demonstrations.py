@@ -37,21 +37,6 @@ from sim.tasks.families import CATEGORIES, FAMILIES
 from sim.tasks.sample import TRAIN_SEEDS, rng_for, sample_task
 from sim.tasks.task import Task
 
-__all__ = [
-    "MISTAKES",
-    "Episode",
-    "Student",
-    "Teacher",
-    "accepted",
-    "demos_of_part",
-    "draw_family",
-    "foreseen",
-    "lessons_of_part",
-    "perturbed",
-    "run_episode",
-    "run_lesson",
-]
-
 #: Plays one episode of a collection with the sessions it may reuse.
 Play = Callable[[CollectConfig, int, dict[tuple[str, str], Session]], "Episode"]
 #: A planner that learns: the step it would take, None when its reply is no step.

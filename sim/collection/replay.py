@@ -26,8 +26,6 @@ from sim.scene.compiler import BASE_JOINTS
 from sim.skills.obstacles import navigation_map
 from sim.world.world import World
 
-__all__ = ["picture_frames", "place_path", "replay_clip", "set_frame"]
-
 Array = NDArray[np.float64]
 _PATH_STRIDE = 4
 

@@ -16,8 +16,6 @@ from robots.spec import RobotSpec
 from sim.scene.catalogue import load_catalogue
 from sim.tasks.drafts import Draft, Scene
 
-__all__ = ["TextFacts"]
-
 #: Actions after which food on a running heat source is cooked. Chosen by hand.
 _COOKING_ACTIONS: Final = 2
 #: Start states under AI2-THOR's names, as conditions.

@@ -16,8 +16,6 @@ from sim.tasks.drafts import Draft, NoDraft, Scene
 from sim.tasks.families import draw
 from sim.tasks.sample import scene_of
 
-__all__ = ["draw_task"]
-
 #: Furniture of made-up rooms.
 _SURFACES: Final = ("CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser", "Shelf")
 _ROOMY: Final = ("CounterTop", "DiningTable", "CoffeeTable", "SideTable", "Desk", "Dresser")

@@ -23,8 +23,6 @@ from sim.collection.text_facts import TextFacts
 from sim.expert.jobs import Setting, plan_jobs
 from sim.tasks.drafts import Draft, Scene
 
-__all__ = ["TextWorld", "feedback_text"]
-
 _HEIGHT_STEP_M: Final = 0.05
 #: Pelvis heights relative to upright, metres: those at the start, the lowest ones of a robot in its room, the highest one.
 _STARTS_M: Final = (0.0, -0.05, -0.1, -0.2, -0.3)

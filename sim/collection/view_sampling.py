@@ -33,8 +33,6 @@ from sim.world.recorder import HISTORY_FRAMES
 from sim.world.rendering import Renderer, View
 from sim.world.world import World, WorldError
 
-__all__ = ["Pose", "camera_in_pelvis", "draw_pose", "set_pose", "type_names", "view_row", "views_of_part", "visible_json"]
-
 Array = NDArray[np.float64]
 
 _KEY_INSTANTS: Final = 7

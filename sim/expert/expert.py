@@ -31,8 +31,6 @@ from sim.skills.registry import excludes
 from sim.tasks.predicates import Predicate
 from sim.world.facts import world_facts
 
-__all__ = ["Expert"]
-
 #: Distances (m) and bearings (deg) that GoTo tries in turn when its own choice of stance does not serve.
 _STANCES: Final[tuple[tuple[float | None, float | None], ...]] = (
     (None, None), (None, -20.0), (None, 20.0), (0.5, None), (0.4, None), (0.6, None), (0.5, -30.0), (0.5, 30.0),

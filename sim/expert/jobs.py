@@ -20,8 +20,6 @@ from interface.facts import Facts, ObjectFacts
 from interface.steps import Action
 from sim.tasks.predicates import Predicate
 
-__all__ = ["Job", "Setting", "pending_leaves", "plan_jobs"]
-
 _NEGATION: Final = {"open": "closed", "closed": "open", "toggled_on": "toggled_off", "toggled_off": "toggled_on"}
 #: What a hand has to hold to bring a state about, and the action that does.
 _TOOL_WORK: Final = {

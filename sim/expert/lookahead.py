@@ -19,8 +19,6 @@ from sim.skills.locomotion import best_stance
 from sim.skills.navigation import Stance
 from sim.skills.registry import assess_action
 
-__all__ = ["HEIGHT_STEP_M", "Rehearsal"]
-
 #: Grid of the expert's height changes.
 HEIGHT_STEP_M: Final = 0.05
 _HEIGHTS: Final = 3

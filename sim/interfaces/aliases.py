@@ -17,8 +17,6 @@ from interface.actions import ACTIONS, ActionKind
 from interface.bodies import Arm
 from interface.steps import Action
 
-__all__ = ["ALIASES", "ARGUMENTS", "number", "to_action"]
-
 #: Foreign names (lower case) of actions of the grammar.
 ALIASES: Final[Mapping[str, str]] = {
     "pickupobject": "Pick",

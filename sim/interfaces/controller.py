@@ -34,8 +34,6 @@ from sim.session.undo import UndoHistory
 from sim.skills.navigation import wrap_angle
 from sim.world.rendering import MAX_SIZE
 
-__all__ = ["THOR_CODES", "Controller", "Event"]
-
 #: AI2-THOR's error code for ours; a code that is not here has no counterpart and is reported as it is.
 THOR_CODES: Final[Mapping[str, str]] = {
     FailureCode.OBJECT_NOT_KNOWN: "ObjectNotVisible",

@@ -35,8 +35,6 @@ from sim.interfaces.poses import interactable_poses
 from sim.session.session import FreePlay, Session, SessionSnapshot
 from sim.skills.locomotion import best_stance
 
-__all__ = ["SCENES", "Controller"]
-
 #: Rooms of ours for DualTHOR's scene names; the names of ours are allowed too.
 SCENES: Final[Mapping[str, str]] = {
     "kitchen": "kitchen_2",

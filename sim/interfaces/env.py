@@ -29,8 +29,6 @@ from interface.steps import ActionError, PlanStep
 from sim.session.session import FreePlay, Session, TaskLike
 from sim.world.recorder import HISTORY_FRAMES
 
-__all__ = ["DualThorEnv"]
-
 _CHARACTERS = string.ascii_letters + string.digits + " ,.&()_-"
 
 

@@ -16,9 +16,6 @@ from sim.scene.objects import ObjectInstance
 from sim.world.placement import box_in_world
 from sim.world.world import World
 
-__all__ = ["object_metadata", "temperature_name", "world_metadata"]
-
-
 Array = NDArray[np.float64]
 _CORNERS: Final = np.array([(i, j, k) for i in (0.0, 1.0) for j in (0.0, 1.0) for k in (0.0, 1.0)])
 #: A pelvis that is lower than standing by more than this is crouching, metres.

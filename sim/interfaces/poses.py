@@ -23,8 +23,6 @@ from sim.skills.body.body import Body
 from sim.world.placement import fits_on
 from sim.world.world import World, WorldError
 
-__all__ = ["InteractablePose", "interactable_poses", "random_placements", "set_object_poses"]
-
 Array = NDArray[np.float64]
 
 _RING_M: Final = 0.1

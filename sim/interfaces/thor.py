@@ -36,8 +36,6 @@ from sim.skills.navigation import wrap_angle
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import Skill
 
-__all__ = ["REFUSED", "Controller", "from_thor", "rotation_to_thor", "to_thor", "yaw_from_thor", "yaw_to_thor"]
-
 Array = NDArray[np.float64]
 Event = own.Event
 

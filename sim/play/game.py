@@ -28,8 +28,6 @@ from sim.session.undo import UndoHistory
 from sim.tasks.task import Task, load_benchmark
 from sim.world.facts import world_facts
 
-__all__ = ["BusyError", "Game", "PlayConfig"]
-
 _LOG = logging.getLogger(__name__)
 _UNDO: Final = 50
 _HEAD_PX: Final = 320

@@ -17,8 +17,6 @@ from sim.skills.runner import CONTROL_DT_S
 from sim.world.rendering import greys, surfaces
 from sim.world.world import World
 
-__all__ = ["LiveView"]
-
 _START_S: Final = 60.0
 #: What of a model changes while a world runs: lamps, liquids, dirt, halves.
 _LOOKS: Final = ("geom_rgba", "geom_size", "geom_pos", "mat_emission")

@@ -29,8 +29,6 @@ from configs.arguments import command, read_arguments
 from sim.play.game import BusyError, Game, PlayConfig
 from sim.play.viewer import HOST
 
-__all__ = ["application", "main"]
-
 _MAX_BODY: Final = 4096
 _FIELDS: Final = {"robot": str, "room": str, "task": (str, type(None)), "difficulty": str, "seed": int}
 

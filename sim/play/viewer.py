@@ -19,8 +19,6 @@ from typing import Any, Final
 import mujoco
 from mujoco.studio import launch_thread, messages, viewer_protocol, web_viewer
 
-__all__ = ["HOST", "STATE", "serve"]
-
 HOST: Final = "127.0.0.1"
 #: What of MuJoCo's data is sent.
 STATE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)

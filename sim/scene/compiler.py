@@ -31,24 +31,6 @@ from sim.scene.surfaces import add_surfaces
 #: Geoms that show spilled liquid, see `sim.world.liquids`.
 PUDDLES: Final = 6
 
-__all__ = [
-    "ARM_BITS",
-    "BASE_JOINTS",
-    "HELD_BITS",
-    "HELD_DOOR_BITS",
-    "LIMB_BIT",
-    "MOVABLE_BITS",
-    "PHYSICS",
-    "PUDDLES",
-    "STATIC_BITS",
-    "TIMESTEP_S",
-    "RobotForScene",
-    "SceneKey",
-    "build_spec",
-    "build_type_spec",
-    "compile_scene",
-]
-
 TIMESTEP_S: Final = 0.005
 #: Version of the physics, raised with each change after which the same plan may end otherwise (models, contacts, solver,
 #: motions of skills). Certificates, runs and tables say with which one they were made. 1: sparse Jacobians where MuJoCo chooses

@@ -17,17 +17,6 @@ from numpy.typing import NDArray
 from interface.facts import Affordances
 from sim.scene.catalogue import Catalogue, MovingSpec, ObjectType, SurfaceSpec
 
-__all__ = [
-    "STATE_NAMES",
-    "MovingPart",
-    "ObjectInstance",
-    "ObjectPlacement",
-    "ObjectState",
-    "Placement",
-    "Surface",
-    "index_object",
-]
-
 ROOM_TEMPERATURE_C: Final = 20.0
 
 

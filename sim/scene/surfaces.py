@@ -15,8 +15,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FLOOR", "PLASTER", "SURFACES", "add_surfaces"]
-
 Picture = NDArray[np.float64]
 
 #: Materials by the colours of the catalogue that are of them.

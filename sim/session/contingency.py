@@ -24,8 +24,6 @@ from configs.assets import asset_files
 from configs.validate import build
 from interface.actions import ACTIONS
 
-__all__ = ["DIFFICULTIES", "OUTCOMES", "Contingency", "ContingencyConfig", "OutcomeRule", "load_contingency"]
-
 #: Outcomes that skills know how to act out.
 OUTCOMES: Final = ("success", "slipped", "spilled", "broken", "nothing", "locked")
 DIFFICULTIES: Final = ("easy", "medium", "hard", "natural")

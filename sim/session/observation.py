@@ -16,8 +16,6 @@ from sim.world.recorder import FRAME_DT_S
 from sim.world.rendering import VISIBILITY_SIZE, camera_intrinsics, camera_pose
 from sim.world.world import World
 
-__all__ = ["head_camera", "observe", "proprioception", "visible_ids"]
-
 
 def visible_ids(visible: Iterable[str], names: Iterable[str]) -> tuple[str, ...]:
     """Ids in the order of the scene."""

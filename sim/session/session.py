@@ -39,8 +39,6 @@ from sim.world.facts import world_facts
 from sim.world.snapshot import WorldSnapshot
 from sim.world.world import World
 
-__all__ = ["FreePlay", "Session", "SessionSnapshot", "SessionStats", "TaskLike"]
-
 
 class GoalLike(Protocol):
     """A condition on a world; `sim.tasks.predicates.Predicate` is one."""

@@ -6,8 +6,6 @@ from collections import deque
 
 from sim.session.session import Session, SessionSnapshot
 
-__all__ = ["UndoHistory"]
-
 
 class UndoHistory:
     """Snapshots before and after the present state.

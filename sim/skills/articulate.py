@@ -36,8 +36,6 @@ from sim.skills.reach import Reach, diagnosed, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import Skill, wait
 
-__all__ = ["assess_open_close", "assess_toggle", "open_close", "plan_handle", "plan_press", "toggle"]
-
 Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
 #: The fingertips reach this far past the bar of a handle.

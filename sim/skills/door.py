@@ -20,8 +20,6 @@ from sim.scene.objects import MovingPart, ObjectInstance
 from sim.skills.body.body import Body
 from sim.skills.body.clearance import AtDoor
 
-__all__ = ["Door"]
-
 Array = NDArray[np.float64]
 
 #: Thickness of an upper arm or forearm around its bone.

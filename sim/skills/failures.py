@@ -11,8 +11,6 @@ from interface.steps import Action
 from sim.world.facts import world_facts
 from sim.world.world import World
 
-__all__ = ["SkillFailure", "failed", "require", "succeeded"]
-
 
 class SkillFailure(Exception):  # noqa: N818  # a failed skill is an outcome, not an error
     """Raised inside a skill to end it with a failure code; the skill runner turns it into an `ActionOutcome`.

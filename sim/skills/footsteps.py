@@ -24,8 +24,6 @@ from robots.build_solver import RobotKit
 from robots.kinematics import root_quaternion
 from robots.leg_ik import solve_legs
 
-__all__ = ["Footsteps", "footsteps"]
-
 Array = NDArray[np.float64]
 _VERSION = 1
 #: A sole rather tilts by a radian than to miss its place by this many metres: heels rise behind.

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from sim.skills.footsteps import Footsteps
 
-__all__ = ["leg_motion"]
-
 Array = NDArray[np.float64]
 #: Turn of the base that counts as one step.
 _TURN_RAD: Final = 0.45

@@ -24,8 +24,6 @@ from sim.scene.objects import ObjectInstance
 from sim.skills.body.body import Body
 from sim.skills.reach_map import HandPose
 
-__all__ = ["Grasp", "grasp_candidates", "solid_box"]
-
 Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
 #: A lid that is open by less than this share belongs to the box of its object.

@@ -19,8 +19,6 @@ from sim.skills.reach import Reach
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill, wait
 
-__all__ = ["assess_hold", "hold", "release"]
-
 
 @cached_plan
 def assess_hold(body: Body, action: Action) -> tuple[Grasp | None, Reach]:

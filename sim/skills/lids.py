@@ -23,8 +23,6 @@ from sim.skills.navigation import Stance
 from sim.skills.reach import Reach, fulfils, plan_reach
 from sim.skills.reach_map import HandPose
 
-__all__ = ["Lead", "closed_on", "led_on", "plan_lead", "plan_tab"]
-
 Array = NDArray[np.float64]
 
 _UP: Final = np.array([0.0, 0.0, 1.0])

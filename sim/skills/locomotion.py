@@ -26,8 +26,6 @@ from sim.skills.navigation import NavigationMap, Stance, wrap_angle
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.skills.trajectory import min_jerk, plan, plan_polyline
 
-__all__ = ["best_stance", "change_height", "go_to", "move", "rotate", "step_to", "sweep"]
-
 WALK_SPEED_M_S: Final = 0.9
 WALK_ACCELERATION_M_S2: Final = 2.0
 TURN_SPEED_RAD_S: Final = 2.2

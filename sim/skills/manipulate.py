@@ -30,21 +30,6 @@ from sim.skills.reach import Reach, diagnose, diagnosed, fulfils, plan_reach, ro
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill, wait
 
-__all__ = [
-    "OutcomeDraw",
-    "grip",
-    "pick",
-    "place",
-    "plan_bring",
-    "plan_pick",
-    "plan_place",
-    "reset_arm",
-    "retreat",
-    "shift_hand",
-    "stow",
-    "upright",
-]
-
 Array = NDArray[np.float64]
 
 #: Draws the contingency of an action on an object.

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-__all__ = ["NavigationMap", "Rectangle", "Stance", "Ways", "wrap_angle"]
-
 _RESOLUTION_M = 0.05
 #: Extra metres of cost per metre of walking close to obstacles: keeps paths off the furniture where there is room.
 _HUG_PENALTY = 0.6

@@ -17,8 +17,6 @@ from sim.scene.compiler import MOVABLE_BITS, STATIC_BITS
 from sim.skills.navigation import NavigationMap, Rectangle
 from sim.world.world import World
 
-__all__ = ["navigation_map", "obstacle_rectangles"]
-
 #: Geoms whose lowest point is above this are passed under, and those below the ankle are stepped over.
 _HEAD_M: Final = 1.9
 _STEP_M: Final = 0.03

@@ -9,8 +9,6 @@ from typing import TypeVar
 from interface.steps import Action
 from sim.skills.body.body import Body
 
-__all__ = ["cached_plan"]
-
 T = TypeVar("T")
 
 

@@ -30,8 +30,6 @@ from sim.skills.runner import CONTROL_DT_S, Skill, wait
 from sim.world.facts import world_facts
 from sim.world.liquids import STEEP, opening_radius_m
 
-__all__ = ["assess_fill", "assess_pour", "fill", "pour"]
-
 Array = NDArray[np.float64]
 
 #: The least tilt that a pour must reach, and the share of what is poured that may go beside.

@@ -37,8 +37,6 @@ from sim.skills.reach import Reach, route
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import Skill, wait
 
-__all__ = ["Push", "plan_push", "push_shut"]
-
 Array = NDArray[np.float64]
 
 #: How far past shut the hand is led, share of the joint's range: the door is pressed against its stop.

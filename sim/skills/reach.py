@@ -22,8 +22,6 @@ from sim.skills.body.ik import REACH_TOLERANCE_M, ArmGoal
 from sim.skills.failures import SkillFailure
 from sim.skills.reach_map import HandPose
 
-__all__ = ["Reach", "diagnose", "diagnosed", "plan_reach", "route"]
-
 Array = NDArray[np.float64]
 T = TypeVar("T")
 

@@ -26,8 +26,6 @@ from data.files import read_cached, write_cached
 from robots.build_solver import RobotKit
 from robots.kinematics import RobotModel
 
-__all__ = ["WOUND_RAD", "HandPose", "ReachMap", "reach_maps"]
-
 Array = NDArray[np.float64]
 
 _SAMPLES: Final = 80000

@@ -17,8 +17,6 @@ from sim.skills.push_door import Push
 from sim.skills.runner import Skill, refuse
 from sim.world.facts import world_facts
 
-__all__ = ["BODY_SKILLS", "SKILLS", "ArmSkill", "assess_action", "excludes", "skills_for"]
-
 
 @dataclass(frozen=True, slots=True)
 class ArmSkill:

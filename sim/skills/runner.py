@@ -18,8 +18,6 @@ from interface.feedback import ActionOutcome
 from interface.steps import Action
 from sim.skills.failures import SkillFailure, failed, succeeded
 
-__all__ = ["CONTROL_DT_S", "Skill", "run_skills", "wait"]
-
 #: A coroutine that acts between its yields.
 Skill = Generator[None, None, None]
 

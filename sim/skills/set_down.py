@@ -33,8 +33,6 @@ from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill, wait
 from sim.skills.two_arm import BOTH_TOLERANCE_M, against_sag, hands_m
 
-__all__ = ["BothPlacement", "assess_place_both", "place_both"]
-
 Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
 #: Heights above its spot at which a load passes over the receptacle's edge, tried in turn, and the least of it that counts as

@@ -27,8 +27,6 @@ from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach
 from sim.skills.runner import Skill, wait
 
-__all__ = ["assess_clean", "assess_slice", "assess_use_up", "clean", "slice_object", "use_up"]
-
 Array = NDArray[np.float64]
 
 #: Length and number of the strokes to and fro.

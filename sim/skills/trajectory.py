@@ -16,8 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-__all__ = ["PolylineTrajectory", "Trajectory", "min_jerk", "plan", "plan_polyline"]
-
 #: Peak speed and acceleration of the minimum-jerk law for unit distance and unit duration.
 _PEAK_SPEED = 1.875
 _PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)

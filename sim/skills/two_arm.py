@@ -29,8 +29,6 @@ from sim.skills.reach import diagnose, route
 from sim.skills.reach_map import HandPose
 from sim.skills.runner import CONTROL_DT_S, Skill, wait
 
-__all__ = ["BOTH_TOLERANCE_M", "against_sag", "assess_lift", "hands_m", "lift"]
-
 Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
 #: Distance of the hands from the load's sides before they close on it, and how far they may be from where they are meant to be.

@@ -16,8 +16,6 @@ import numpy as np
 from sim.tasks.instructions import phrase, preposition, shuffled, wordings
 from sim.tasks.predicates import Predicate
 
-__all__ = ["Builder", "Draft", "NoDraft", "Scene"]
-
 #: Start states that make a type a load for two hands: a full pot, a packed box.
 _LOADS: Final[Mapping[str, Mapping[str, bool | float | str]]] = {
     "Pot": {"isFilledWithLiquid": True},

@@ -19,8 +19,6 @@ from sim.tasks.drafts import Builder, Draft, Scene
 from sim.tasks.instructions import plural, preposition
 from sim.tasks.predicates import ANY, Predicate
 
-__all__ = ["CATEGORIES", "FAMILIES", "Family", "draw", "family_of"]
-
 CATEGORIES: Final = ("single", "optional", "essential")
 
 _FOOD_STEADY: Final = ("Bread", "Lettuce")

@@ -14,8 +14,6 @@ from typing import Final
 
 import numpy as np
 
-__all__ = ["ORDINALS", "TEMPLATES", "natural_name", "phrase", "plural", "preposition", "shuffled", "wordings"]
-
 _SPECIAL: Final[Mapping[str, str]] = {
     "TVStand": "TV stand",
     "Television": "TV",

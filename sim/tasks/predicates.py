@@ -13,8 +13,6 @@ from typing import Any, Final, Literal
 
 from interface.facts import ObjectFacts
 
-__all__ = ["ANY", "KINDS", "Predicate", "PredicateError"]
-
 Kind = Literal[
     "on", "in", "held", "lifted", "open", "closed", "toggled_on", "toggled_off", "filled", "sliced", "cooked", "clean",
     "used_up", "and", "or", "not", "count", "exists",

@@ -29,19 +29,6 @@ from sim.tasks.task import Placement, Start, Task
 from sim.world.placement import OVERHANG_SHARE, fits_on
 from sim.world.world import World, WorldError
 
-__all__ = [
-    "BENCHMARK_SEEDS",
-    "BIG_TYPES",
-    "ROOMS",
-    "TRAIN_ROOMS",
-    "TRAIN_SEEDS",
-    "UNSEEN_TYPES",
-    "rng_for",
-    "sample_task",
-    "scene_of",
-    "settle",
-]
-
 #: Rooms of the training tasks: of every kind one room is kept back.
 TRAIN_ROOMS: Final = ("kitchen_1", "kitchen_2", "living_room_1", "living_room_2", "bedroom_1", "bathroom_1")
 ROOMS: Final = room_names()

@@ -19,19 +19,6 @@ from data.files import write_text
 from interface.episode import STEP_LIMIT
 from sim.tasks.predicates import Predicate
 
-__all__ = [
-    "BENCHMARK_PATH",
-    "CATEGORIES",
-    "Placement",
-    "Start",
-    "Task",
-    "TaskError",
-    "load_benchmark",
-    "read_tasks",
-    "tasks_text",
-    "write_tasks",
-]
-
 BENCHMARK_PATH: Final = Path(__file__).parent / "benchmark.jsonl"
 CATEGORIES: Final = ("single", "optional", "essential")
 

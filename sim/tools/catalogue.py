@@ -25,8 +25,6 @@ from sim.scene.rooms import load_room, room_names
 from sim.session.contingency import DIFFICULTIES, OUTCOMES
 from sim.world.rendering import CAMERAS
 
-__all__ = ["inventory", "main"]
-
 Row = dict[str, Any]
 
 

@@ -24,8 +24,6 @@ from typing import Final
 from configs.arguments import EXTRAS, command, read_arguments
 from data.files import cache_folder
 
-__all__ = ["CHECKS", "Finding", "main"]
-
 #: Largest time for one drawing test, seconds.
 _PATIENCE_S: Final = 20
 #: Memory of an evaluation with two workers, gigabytes.

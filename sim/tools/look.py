@@ -29,8 +29,6 @@ from sim.session.session import Session
 from sim.tasks.task import load_benchmark
 from sim.world.world import World
 
-__all__ = ["contact_sheet", "lid_sheet", "main", "robot_poses", "room_pictures", "room_sheet"]
-
 
 def room_pictures(folder: Path, robot: str = DEFAULT_ROBOT) -> Iterator[Path]:
     """Overview, plan, head view at 500 and 112 pixels and side view of every room with its default objects."""

@@ -37,8 +37,6 @@ from data.skeleton import JOINTS, PARENTS, HumanMotion, index
 from data.sources import SUFFIXES, load_file
 from robots.spec import available_robots, load_robot
 
-__all__ = ["film", "find_clip", "main", "title_lines"]
-
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 _WIDTH: Final = 320

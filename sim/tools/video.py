@@ -33,8 +33,6 @@ from sim.tasks.task import load_benchmark
 from sim.world.rendering import CAMERAS, Renderer
 from sim.world.world import World
 
-__all__ = ["VideoConfig", "VideoRecorder", "check_film", "main"]
-
 _CAPTION_PX: Final = 28
 _HOLD_S: Final = 0.5
 

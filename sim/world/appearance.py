@@ -11,8 +11,6 @@ from sim.scene.catalogue import Part
 from sim.scene.objects import ObjectInstance
 from sim.world.scene_state import SceneState
 
-__all__ = ["Appearance"]
-
 _WATER: Final = (0.30, 0.55, 0.95, 0.9)
 
 

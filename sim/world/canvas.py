@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from robots.gl import RenderingError
 
-__all__ = ["Canvas", "shared_canvas"]
-
 
 class Canvas:
     """An offscreen buffer of one size.

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from sim.scene.compiler import ARM_BITS, HELD_BITS, HELD_DOOR_BITS, LIMB_BIT, MOVABLE_BITS, STATIC_BITS
 
-__all__ = ["GraspConstraints"]
-
 _SEPARATION_M = 0.001
 #: Time constants with which a grasp takes up an error of the hand.
 _FIRM_S = 0.01

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from sim.world.placement import REACH_BAND_M, above_surfaces, find_free_spot
 from sim.world.scene_state import SceneState
 
-__all__ = ["Containment"]
-
 
 class Containment:
     """Receptacles and their contents, read from the objects' poses.

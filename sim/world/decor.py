@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from sim.world.scene_state import SceneState
 
-__all__ = ["Board", "wall_decor"]
-
 #: Height and half thickness of skirting boards.
 _SKIRTING_M: Final = (0.09, 0.012)
 #: Sill and lintel over the floor, the greatest width, and the wall that stays free at either side.

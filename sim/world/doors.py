@@ -10,8 +10,6 @@ import numpy as np
 from sim.scene.objects import ObjectInstance
 from sim.world.scene_state import SceneState, WorldError
 
-__all__ = ["Doors"]
-
 #: What a self-closing door or drawer is shut with, and how long its damper lets that take.
 _SPRING_TORQUE_N_M: Final = 2.0
 _SPRING_FORCE_N: Final = 6.0

@@ -6,8 +6,6 @@ from interface.bodies import Arm
 from interface.facts import Facts, ObjectFacts
 from sim.world.world import World
 
-__all__ = ["world_facts"]
-
 
 def world_facts(world: World) -> Facts:
     """What is the case now."""

@@ -16,8 +16,6 @@ from sim.world.poses import ObjectPoses
 from sim.world.scene_state import SceneState, WorldError
 from sim.world.servos import Servos
 
-__all__ = ["Grasps"]
-
 #: Objects that are lighter than this are opened with gentle fingers.
 _LIGHT_KG: Final = 1.5
 

@@ -8,8 +8,6 @@ from sim.world.poses import ObjectPoses
 from sim.world.scene_state import SceneState
 from sim.world.states import ObjectStates
 
-__all__ = ["BREAK_SPEED_M_S", "Impacts"]
-
 BREAK_SPEED_M_S: Final = 2.6
 
 

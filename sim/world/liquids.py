@@ -25,8 +25,6 @@ from sim.world.masses import Masses
 from sim.world.poses import ObjectPoses
 from sim.world.scene_state import SceneState
 
-__all__ = ["LIQUIDS", "STEEP", "LiquidLedger", "Puddle", "opening_radius_m"]
-
 LIQUIDS: Final = ("water", "coffee", "wine")
 TAP_L_S: Final = 0.15
 COFFEE_L_S: Final = 0.05

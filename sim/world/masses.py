@@ -5,8 +5,6 @@ from __future__ import annotations
 from sim.scene.objects import ObjectInstance
 from sim.world.scene_state import SceneState
 
-__all__ = ["Masses"]
-
 
 class Masses:
     """Body masses and inertias of MuJoCo's model.

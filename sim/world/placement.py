@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from sim.scene.catalogue import ObjectType
 from sim.scene.objects import ObjectInstance, Surface
 
-__all__ = ["OVERHANG_SHARE", "REACH_BAND_M", "above_surfaces", "box_in_world", "boxes_in_world", "find_free_spot", "fits_on"]
-
 #: Depth from a receptacle's reachable edge within which objects are put.
 REACH_BAND_M: Final = 0.35
 #: Share of an object's narrow half that has to be on the surface: a wide load may stand over the edge by the rest.

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from sim.world.placement import box_in_world
 from sim.world.scene_state import SceneState, WorldError
 
-__all__ = ["ObjectPoses"]
-
 
 class ObjectPoses:
     """Geometry of the objects of a running scene; world frame, metres.

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from interface.bodies import KEY_BODIES, SIDES
 from robots.spec import RobotSpec
 
-__all__ = ["FRAME_DT_S", "HISTORY_FRAMES", "MotionWindow", "Recorder"]
-
 FRAME_DT_S: Final = 0.05
 HISTORY_FRAMES: Final = 64
 

@@ -16,7 +16,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from robots.gl import RenderingError
 from sim.scene.catalogue import load_catalogue
 from sim.scene.surfaces import FLOOR, PLASTER, SURFACES
 from sim.world.canvas import shared_canvas
@@ -24,20 +23,6 @@ from sim.world.decor import wall_decor
 from sim.world.poses import ObjectPoses
 from sim.world.scene_state import SceneState
 from sim.world.servos import Servos
-
-__all__ = [
-    "CAMERAS",
-    "MAX_SIZE",
-    "VISIBILITY_SIZE",
-    "Cameras",
-    "Renderer",
-    "RenderingError",
-    "View",
-    "camera_intrinsics",
-    "camera_pose",
-    "greys",
-    "surfaces",
-]
 
 CAMERAS: Final = ("head", "front", "left", "right", "behind", "top", "overview", "plan")
 MAX_SIZE: Final = 1280

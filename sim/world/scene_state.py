@@ -23,8 +23,6 @@ from sim.scene.compiler import SceneKey, compile_scene
 from sim.scene.objects import ObjectInstance, ObjectState, index_object
 from sim.scene.rooms import Room
 
-__all__ = ["SceneState", "WorldError", "build_scene", "scene_key"]
-
 
 class WorldError(ValueError):
     """A world that cannot be built or asked as requested; the message names the value and what is allowed."""

@@ -16,8 +16,6 @@ from sim.scene.compiler import BASE_JOINTS
 from sim.world.recorder import Recorder
 from sim.world.scene_state import SceneState, WorldError
 
-__all__ = ["Servos"]
-
 
 class Servos:
     """Position servos of one robot.

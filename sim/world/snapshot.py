@@ -15,8 +15,6 @@ from typing import Any, Final
 import mujoco
 from numpy.typing import NDArray
 
-__all__ = ["MODEL_FIELDS", "WorldSnapshot", "read_physics", "write_physics"]
-
 #: Arrays of the model that a running world writes to.
 MODEL_FIELDS: Final = (
     "eq_obj1id",

@@ -10,8 +10,6 @@ from sim.world.liquids import LIQUIDS, LiquidLedger
 from sim.world.masses import Masses
 from sim.world.scene_state import SceneState, WorldError
 
-__all__ = ["ObjectStates"]
-
 #: The property of an object's type that a state takes.
 _NEEDS: Final = {
     "isToggled": "toggleable", "isBroken": "breakable", "isFilledWithLiquid": "fillable", "fillLiquid": "fillable",

@@ -14,8 +14,6 @@ from sim.world.containment import Containment
 from sim.world.scene_state import SceneState
 from sim.world.states import ObjectStates
 
-__all__ = ["Thermal"]
-
 _HOT_C: Final = 95.0
 _COLD_C: Final = 4.0
 _COOKED_C: Final = 65.0

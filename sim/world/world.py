@@ -42,8 +42,6 @@ from sim.world.snapshot import WorldSnapshot, read_physics, write_physics
 from sim.world.states import ObjectStates
 from sim.world.thermal import Thermal
 
-__all__ = ["World"]
-
 #: How often liquids flow from taps, and temperatures change, seconds of simulated time.
 TICK_S: Final = 1.0
 _STEPS_PER_FRAME: Final = round(FRAME_DT_S / TIMESTEP_S)

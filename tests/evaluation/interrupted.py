@@ -13,7 +13,8 @@ from conftest import FakeSession, make_task
 from configs.schema.eval import EvalConfig, PlannerConfig
 from configs.schema.robot import RobotConfig
 from proprio_mllm.evaluation.run import evaluate
-from proprio_mllm.report.runs import load_run, write_report
+from proprio_mllm.report.runs import write_report
+from proprio_mllm.report.stored import load_run
 from sim.tasks.task import write_tasks
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from interface.actions import ActionKind
-from interface.failures import FailureCategory, FailureCode
+from interface.failures import INVALID_OUTPUT, FailureCategory, FailureCode
 from interface.feedback import category_of
 from interface.steps import Action
-from proprio_mllm.evaluation.attribution import INVALID_OUTPUT, Deciding, attribute, deciding_failure, unmet_objects
+from proprio_mllm.evaluation.attribution import Deciding, attribute, deciding_failure, unmet_objects
 from sim.tasks.task import load_benchmark
 
 

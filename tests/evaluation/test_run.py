@@ -20,7 +20,8 @@ from proprio_mllm.evaluation import run as running
 from proprio_mllm.evaluation.ledger import Ledger, LedgerError, read_ledger
 from proprio_mllm.evaluation.run import config_hash, evaluate, plan_episodes, run_folder, select_tasks, weights_digest
 from proprio_mllm.planners.protocol import WeightsError
-from proprio_mllm.report.runs import load_run, write_report
+from proprio_mllm.report.runs import write_report
+from proprio_mllm.report.stored import load_run
 from sim.tasks.task import write_tasks
 
 SCRIPT = Path(__file__).parent / "interrupted.py"

@@ -15,7 +15,7 @@ from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.evaluation.sessions import open_session
 from proprio_mllm.planners.protocol import Planner, TaskInfo
 from proprio_mllm.planners.random_planner import RandomPlanner
-from proprio_mllm.report.runs import load_run
+from proprio_mllm.report.stored import load_run
 from proprio_mllm.report.strip import draw_strip, main, replay
 from sim.tasks.predicates import Predicate
 from sim.tasks.task import Placement, Start, Task, write_tasks

@@ -18,8 +18,8 @@ from interface.steps import PlanStep
 from proprio_mllm.report.export import ExportConfig as Config
 from proprio_mllm.report.export import ExportError, export, main, read_sft, read_traces
 from proprio_mllm.report.html import run_data
-from proprio_mllm.report.runs import load_run
 from proprio_mllm.report.sft import plan_prompt
+from proprio_mllm.report.stored import load_run
 from tests.report.ledgers import HOSTILE, LAMP, PLANT, failed, fine, step, write_run
 
 

@@ -92,7 +92,7 @@ def test_failure_bars_carry_their_numbers() -> None:
 
 
 def test_a_figure_says_which_runs_it_shows(tmp_path: Path, monkeypatch, run) -> None:
-    from proprio_mllm.report.runs import find_runs
+    from proprio_mllm.report.stored import find_runs
 
     saved = _drawn(monkeypatch)
     run(tmp_path)

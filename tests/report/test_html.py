@@ -17,7 +17,7 @@ from proprio_mllm.evaluation.ledger import Ledger
 from proprio_mllm.report.frames import act_out, episode_id
 from proprio_mllm.report.html import main, page, run_data
 from proprio_mllm.report.reenact import RunTasks
-from proprio_mllm.report.runs import load_run
+from proprio_mllm.report.stored import load_run
 from sim.tasks.task import write_tasks
 from tests.browser import Browser
 from tests.report.ledgers import HOSTILE, LAMP, failed, fine, record_of, step, write_run

@@ -11,7 +11,8 @@ from interface.episode import Outcome
 from proprio_mllm.evaluation.run import task_key
 from proprio_mllm.report.metrics import Certificate, References, extras_of, first_tries, path_efficiency, recoveries
 from proprio_mllm.report.references import read_certificates, references_of
-from proprio_mllm.report.runs import load_run, write_report
+from proprio_mllm.report.runs import write_report
+from proprio_mllm.report.stored import load_run
 from sim.tasks.task import load_benchmark
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from proprio_mllm.report.replay import main
-from proprio_mllm.report.runs import load_run
+from proprio_mllm.report.stored import load_run
 
 
 @pytest.mark.parametrize(("typed", "shown"), [("\n" * 50, None), ("\n\nc\n", None), ("", None), ("\nq\n", 1)])

@@ -19,8 +19,9 @@ from proprio_mllm.backends.spending import Spending
 from proprio_mllm.evaluation.ledger import Ledger
 from proprio_mllm.report import paper
 from proprio_mllm.report.experiments import EXPERIMENTS, ablation_table, assemble, main_table, replanning_table
-from proprio_mllm.report.runs import find_runs, load_run, newest, run_notes, run_report, write_report
+from proprio_mllm.report.runs import newest, run_notes, run_report, write_report
 from proprio_mllm.report.statistics import wilson
+from proprio_mllm.report.stored import find_runs, load_run
 from proprio_mllm.report.summary import rows_of
 from proprio_mllm.report.table import Table, in_time_cell, rate_cell, run_table
 from tests.report.ledgers import LAMP, record_of

@@ -8,7 +8,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from proprio_mllm.report.runs import load_run
+from proprio_mllm.report.stored import load_run
 from proprio_mllm.report.video import main
 
 

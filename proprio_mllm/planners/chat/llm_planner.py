@@ -37,8 +37,6 @@ from proprio_mllm.planners.chat.view import encoded, scene_text
 from proprio_mllm.planners.memory import MemoryEpisode, MemoryFileError
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 
-__all__ = ["LEAST_LIKENESS", "WHOLE_PLAN_RULES", "LlmPlanner", "example_text", "with_known_names"]
-
 #: Least cosine at which an unknown object is taken for a known one.
 LEAST_LIKENESS: Final = 0.8
 WHOLE_PLAN_RULES: Final = (

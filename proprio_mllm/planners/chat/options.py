@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from configs.schema.backend import BackendConfig
 from configs.schema.eval import PlannerConfig
 
-__all__ = ["ChatOptions"]
-
 
 @dataclass(frozen=True, slots=True)
 class ChatOptions:

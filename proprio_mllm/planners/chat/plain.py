@@ -24,8 +24,6 @@ from proprio_mllm.planners.chat.role import role
 from proprio_mllm.planners.chat.view import encoded, scene_text
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 
-__all__ = ["PLAN_RULES", "PlainPlanner", "system_text"]
-
 PLAN_RULES = (
     "Look at the picture, the names and the log, and decide what comes next. What you need and do not know has to be looked "
     "for: turn, walk, open things.\n"

@@ -35,8 +35,6 @@ from proprio_mllm.planners.chat.view import encoded, scene_text
 from proprio_mllm.planners.memory import MemoryEpisode, MemoryFileError
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 
-__all__ = ["OUTLINE_RULES", "STEP_RULES", "Outline", "RapPlanner", "SearchKey", "Thought", "moment_text", "task_text"]
-
 _KEY: Final = '"key": {"kind": "object" or "action", "text": "..."}'
 OUTLINE_RULES: Final = (
     "The experiences are similar tasks that were done before. Write the overall plan of your task, one line per step, and say "

@@ -34,8 +34,6 @@ from proprio_mllm.planners.memory import (
     read_memory,
 )
 
-__all__ = ["AROUND", "Key", "Moment", "MomentRecall", "TaskRecall", "load_moments", "load_tasks", "seen_words"]
-
 #: Steps before and after the best one that are brought to mind with it.
 AROUND: Final = 2
 

@@ -18,8 +18,6 @@ from proprio_mllm.planners.chat.replies import Reflection
 from proprio_mllm.planners.chat.view import encoded, scene_text
 from proprio_mllm.planners.protocol import succeeded
 
-__all__ = ["REFLECTION_RULES", "Seen", "changed_text", "completed_steps", "failed_text", "reflect"]
-
 REFLECTION_RULES = (
     "The last step failed. Think about why: name the cause, say what has to change, then give the next steps from here. "
     "Do not repeat what has just failed unless bad luck was the cause or you change what made it fail.\n"

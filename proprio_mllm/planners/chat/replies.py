@@ -14,8 +14,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from interface.steps import ActionError, PlanStep
 from proprio_mllm.backends.protocol import ChatReply
 
-__all__ = ["Plan", "Reflection", "ReplyError", "read_json", "read_reply", "read_steps"]
-
 T = TypeVar("T", bound=BaseModel)
 #: Longest reply that is searched for JSON, characters, and most places in it that are tried.
 _LONGEST = 200_000

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from data.robot_facts import robot_facts
 
-__all__ = ["role"]
-
 
 def role(robot: str) -> str:
     """Who the model is: the robot's body in numbers."""

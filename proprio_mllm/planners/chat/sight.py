@@ -25,8 +25,6 @@ import configs
 from data.files import file_hash
 from proprio_mllm.planners.bars import without_bar
 
-__all__ = ["ImageEncoder", "SightError", "image_encoder", "weights_digest"]
-
 _ROOT: Final = Path(configs.__file__).resolve().parent.parent
 
 

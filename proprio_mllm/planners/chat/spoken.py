@@ -8,8 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-__all__ = ["plan_words", "step_words", "type_words"]
-
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 _NUMBER = re.compile(r"_\d+\b|(?<![A-Za-z])-?\d+(?:\.\d+)?")
 _ARM = re.compile(r"(?<=[(,\s])(?:left|right|auto)(?=\s*[,)])")

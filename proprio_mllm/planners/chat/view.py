@@ -17,8 +17,6 @@ from interface.bodies import KEY_BODIES
 from interface.observation import HistoryItem, Observation, Proprioception
 from proprio_mllm.backends.protocol import ChatImage
 
-__all__ = ["body_text", "encoded", "log_text", "scene_text"]
-
 _HANDS: Final = {"left": KEY_BODIES.index("left_hand"), "right": KEY_BODIES.index("right_hand")}
 
 

@@ -14,8 +14,6 @@ from typing import Final
 from proprio_mllm.planners.furniture import CONTAINERS
 from proprio_mllm.planners.scripted.words import Mention
 
-__all__ = ["INTO", "KIND_OF", "PREPOSITIONS", "Sentence", "read_sentence"]
-
 #: Vessels that one pours from.
 _POURERS: Final = ("bottle", "winebottle", "kettle", "wateringcan", "jug", "pitcher")
 #: Verbs by the kind of goal that they ask for.

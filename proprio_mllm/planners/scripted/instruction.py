@@ -16,8 +16,6 @@ from typing import Final
 from proprio_mllm.planners.scripted.idioms import INTO, KIND_OF, PREPOSITIONS, Sentence, read_sentence
 from proprio_mllm.planners.scripted.words import Mention, find_mentions
 
-__all__ = ["TOOLS", "Goal", "read_goals"]
-
 #: Names of what slices and what wipes.
 TOOLS: Final = {"sliced": ("knife", "butterknife"), "clean": ("dishsponge", "handtowel")}
 

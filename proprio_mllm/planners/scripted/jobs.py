@@ -19,8 +19,6 @@ from interface.failures import FailureCode
 from interface.steps import Action
 from proprio_mllm.planners.scripted.words import Mention, type_of
 
-__all__ = ["Job", "Want", "holds", "next_jobs"]
-
 #: Types that take both hands, as far as one can know.
 _BIG: Final = ("houseplant", "box", "laundryhamper", "pot", "microwave", "television")
 #: Types that are shut when nobody says otherwise.

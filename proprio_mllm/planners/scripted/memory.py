@@ -15,8 +15,6 @@ from interface.steps import Action
 from proprio_mllm.planners.furniture import CONTAINERS, SEATS, SURFACES
 from proprio_mllm.planners.scripted.words import Mention, candidates, type_of
 
-__all__ = ["Memory"]
-
 #: How to look around at a place: names and amounts.
 _LOOKS: Final = (("RotateLeft", 45.0), ("RotateRight", 90.0), ("MoveBack", 0.3), ("RotateLeft", 45.0), ("MoveUp", 0.2))
 

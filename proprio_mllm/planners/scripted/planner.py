@@ -30,8 +30,6 @@ from proprio_mllm.planners.scripted.jobs import Job, Want, next_jobs
 from proprio_mllm.planners.scripted.memory import Memory
 from proprio_mllm.planners.scripted.words import Mention
 
-__all__ = ["ScriptedPlanner"]
-
 #: Distances (m) and bearings (deg) of the stances that are tried in turn.
 _STANCES: Final[tuple[tuple[float | None, float | None], ...]] = (
     (None, None), (None, -20.0), (None, 20.0), (0.5, None), (0.4, None), (0.6, None), (0.5, -30.0), (0.5, 30.0),

@@ -12,8 +12,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["Mention", "candidates", "find_mentions", "type_of"]
-
 #: Longest instruction that is read, characters.
 _LONGEST: Final = 2000
 _ORDINALS: Final = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth")

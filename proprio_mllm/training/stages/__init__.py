@@ -17,8 +17,6 @@ from proprio_mllm.training.stages.selu import SeluStage
 from proprio_mllm.training.stages.tokenizer import TokenizerStage
 from proprio_mllm.training.stages.words import WordsStage
 
-__all__ = ["STAGES"]
-
 STAGES: Final[Mapping[str, Stage]] = {
     "words": WordsStage(),
     "practice": PracticeStage(),

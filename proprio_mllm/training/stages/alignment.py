@@ -20,8 +20,6 @@ from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, t
 from proprio_mllm.training.turns import turn_accuracy
 from proprio_mllm.training.words import held_out_metrics
 
-__all__ = ["AlignmentStage", "start"]
-
 
 class AlignmentStage:
     """The phases of `PHASES`, each a loop over its own parameter groups."""

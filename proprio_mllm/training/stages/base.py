@@ -20,8 +20,6 @@ from proprio_mllm.training.text import adopt, corpus, start_from_words, whole_wo
 from proprio_mllm.training.turns import turn_accuracy
 from proprio_mllm.training.words import held_out_metrics
 
-__all__ = ["BaseStage"]
-
 
 class BaseStage:
     """Dense grounding of the tower first, then grounding and planning together, all weights training."""

@@ -12,8 +12,6 @@ from proprio_mllm.training.sources import Demos
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordsObjective, mixed
 
-__all__ = ["episodes_in_words", "lesson_folders", "lessons_of", "turns_of"]
-
 
 def lesson_folders(pipeline: Pipeline) -> list[Path]:
     """Shards of episodes in the simulator: the teacher's, and those in which the words model acted where there is one."""

@@ -12,8 +12,6 @@ from proprio_mllm.training.geometry_stage import PointMapObjective, point_map_er
 from proprio_mllm.training.pipeline import Metrics, Pipeline, loop_values, seeded
 from proprio_mllm.training.sources import Views
 
-__all__ = ["PointMapStage"]
-
 
 class PointMapStage:
     """Metric points from single views."""

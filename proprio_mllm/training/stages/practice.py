@@ -17,8 +17,6 @@ from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError
 from proprio_mllm.training.rollouts import DaggerRequest
 from proprio_mllm.training.words import WordsObjective, held_out_metrics, mixed
 
-__all__ = ["PracticeStage"]
-
 
 class PracticeStage:
     """One loop over episodes of the text world, of the teacher in the simulator, and of the model itself there."""

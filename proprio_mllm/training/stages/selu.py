@@ -46,8 +46,6 @@ from proprio_mllm.training.pipeline import Metrics, Pipeline
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
 from proprio_mllm.training.stages.inputs import lessons_of, turns_of
 
-__all__ = ["ACTOR", "CRITIC", "ExampleObjective", "SeluStage", "copy_adapter", "train_adapter"]
-
 logger = logging.getLogger(__name__)
 
 #: Adapter names; the actor's is the one that stage 2 trained.

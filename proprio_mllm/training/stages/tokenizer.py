@@ -16,8 +16,6 @@ from proprio_mllm.training.pipeline import Metrics, Pipeline, loop_values, seede
 from proprio_mllm.training.reconstruction import render
 from proprio_mllm.training.sources import Clips
 
-__all__ = ["TokenizerStage"]
-
 
 class TokenizerStage:
     """Motion windows to discrete codes."""

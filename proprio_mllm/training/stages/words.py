@@ -13,8 +13,6 @@ from proprio_mllm.model.word_tokens import add_word_tokens
 from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config
 from proprio_mllm.training.words import WordsObjective, held_out_metrics, mixed
 
-__all__ = ["WordsStage"]
-
 
 class WordsStage:
     """One loop over episodes that are made as they are needed, and some that the simulator wrote."""

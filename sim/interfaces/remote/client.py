@@ -15,9 +15,6 @@ from configs.schema.checks import is_loopback
 from sim.interfaces.controller import Event, Stopped
 from sim.interfaces.remote.protocol import IMAGES, decode_event, dumps
 
-__all__ = ["RemoteController", "RemoteError"]
-
-
 #: Pauses before a server that nobody listens for is tried again: it may be starting.
 _PAUSES_S: Final = (0.5, 1.5)
 

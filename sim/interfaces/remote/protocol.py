@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from data.files import parse_json
 from sim.interfaces.controller import Event
 
-__all__ = ["IMAGES", "VERSION", "ProtocolError", "decode_event", "dumps", "encode_event", "images_of", "loads"]
-
 VERSION: Final = 1
 IMAGES: Final = ("frame", "depth_frame", "instance_segmentation_frame", "third_party_camera_frames")
 DEFAULT_IMAGES: Final = ("frame",)

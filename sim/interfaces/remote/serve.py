@@ -14,8 +14,6 @@ from configs.arguments import read_arguments
 from configs.validate import ConfigError
 from sim.interfaces.remote.server import RemoteServer, ServerConfig
 
-__all__ = ["TOKEN_VARIABLE", "main"]
-
 TOKEN_VARIABLE: Final = "DUALTHOR_TOKEN"
 
 

@@ -27,8 +27,6 @@ from sim.interfaces.remote.worlds import (
     Worlds,
 )
 
-__all__ = ["RemoteServer", "ServerConfig"]
-
 _LOG = logging.getLogger(__name__)
 _MAX_BODY: Final = 1 << 20
 #: The most of a body that is too long that is read and thrown away.

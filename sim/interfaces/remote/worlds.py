@@ -19,8 +19,6 @@ from typing import Any
 
 from data.workers import start_worker
 
-__all__ = ["WorldBrokeError", "WorldGoneError", "WorldOverError", "WorldRefusedError", "Worlds"]
-
 _LOG = logging.getLogger(__name__)
 
 #: Arguments of `Controller` that a client may give.

@@ -20,20 +20,6 @@ from configs.assets import own_files
 from configs.validate import ConfigError, build
 from interface.facts import Affordances
 
-__all__ = [
-    "CATALOGUE_PATH",
-    "MATERIALS",
-    "OPTIONS",
-    "PROPERTIES",
-    "SHAPES",
-    "Catalogue",
-    "MovingSpec",
-    "ObjectType",
-    "Part",
-    "SurfaceSpec",
-    "load_catalogue",
-]
-
 CATALOGUE_PATH: Final = Path(__file__).parent / "object_types.yaml"
 _VERSION: Final = 1
 

@@ -19,8 +19,6 @@ from configs.assets import asset_files
 from configs.validate import ConfigError, allowed_values, build
 from sim.scene.catalogue import Catalogue, Part, load_catalogue
 
-__all__ = ["ROOMS_PATH", "DefaultObject", "Furniture", "Room", "load_room", "room_names"]
-
 ROOMS_PATH: Final = Path(__file__).parent
 _ID = re.compile(r"^([A-Za-z][A-Za-z0-9]*)_[1-9][0-9]*$")
 

@@ -18,8 +18,6 @@ from sim.skills.body.ready import ready_posture
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.skills.trajectory import Trajectory, plan
 
-__all__ = ["ARM_ACCELERATION_RAD_S2", "ARM_SPEED_RAD_S", "Arms"]
-
 Array = NDArray[np.float64]
 
 #: Bounds of every arm joint at speed 1, rad/s and rad/s². Chosen by hand.

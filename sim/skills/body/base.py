@@ -14,8 +14,6 @@ from sim.skills.navigation import Stance
 from sim.skills.runner import CONTROL_DT_S
 from sim.world.world import World
 
-__all__ = ["Base"]
-
 Array = NDArray[np.float64]
 
 

@@ -30,8 +30,6 @@ from sim.skills.body.workspace import Workspace
 from sim.skills.navigation import Stance
 from sim.world.world import World
 
-__all__ = ["Body"]
-
 
 @dataclass(slots=True)
 class Plans:

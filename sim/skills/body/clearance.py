@@ -21,8 +21,6 @@ from sim.skills.body.joints import JointMap
 from sim.skills.body.posture import Posture
 from sim.world.world import World
 
-__all__ = ["TOUCH_M", "AtDoor", "ClearanceProbe"]
-
 Array = NDArray[np.float64]
 
 #: Penetration that still counts as touching only.

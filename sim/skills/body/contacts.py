@@ -12,8 +12,6 @@ from sim.scene.objects import ObjectInstance
 from sim.skills.body.joints import JointMap
 from sim.world.world import World
 
-__all__ = ["Contacts"]
-
 Array = NDArray[np.float64]
 
 

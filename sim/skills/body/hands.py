@@ -13,8 +13,6 @@ from sim.skills.body.joints import JointMap
 from sim.skills.runner import CONTROL_DT_S, Skill
 from sim.world.world import World
 
-__all__ = ["Hands"]
-
 Array = NDArray[np.float64]
 
 #: Time that a hand takes to open or close, seconds. Chosen by hand.

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 
 from sim.skills.navigation import Stance
 
-__all__ = ["Hypothesis"]
-
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:

@@ -26,8 +26,6 @@ from sim.skills.body.ready import ready_posture
 from sim.skills.navigation import Stance
 from sim.skills.reach_map import WOUND_RAD, HandPose, ReachMap, reach_maps
 
-__all__ = ["REACH_TOLERANCE_M", "ArmGoal", "BothGoal", "InverseKinematics"]
-
 Array = NDArray[np.float64]
 
 #: Position error of an arm posture that still counts as reaching, metres. Chosen by hand.

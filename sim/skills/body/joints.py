@@ -10,8 +10,6 @@ from interface.bodies import Arm
 from robots.spec import RobotSpec
 from sim.scene.compiler import BASE_JOINTS
 
-__all__ = ["JointMap"]
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from sim.scene.objects import ObjectInstance
 from sim.world.world import World
 
-__all__ = ["ObjectGeometry"]
-
 Array = NDArray[np.float64]
 
 

@@ -16,8 +16,6 @@ from sim.skills.body.joints import JointMap
 from sim.skills.navigation import Stance
 from sim.skills.reach_map import HandPose, reach_maps
 
-__all__ = ["Posture", "quaternion_about_y"]
-
 Array = NDArray[np.float64]
 
 

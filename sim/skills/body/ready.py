@@ -14,8 +14,6 @@ from robots.build_solver import RobotKit
 from robots.solver import ReachTarget
 from sim.skills.reach_map import HandPose, reach_maps
 
-__all__ = ["carrying_posture", "ready_posture"]
-
 Array = NDArray[np.float64]
 
 #: Height of the highest surfaces that a robot walks up to with a load, with some room below the load, metres.

@@ -17,8 +17,6 @@ from sim.skills.reach_map import reach_maps
 from sim.world.placement import OVERHANG_SHARE
 from sim.world.world import World
 
-__all__ = ["Workspace"]
-
 Array = NDArray[np.float64]
 
 #: Share of the shoulders' way forward in a lean by which the robot stands farther from things. Chosen by hand.

@@ -20,8 +20,6 @@ from proprio_mllm.planners.chat.dag_plan.graph import Graph, Node, NodeKind, Nod
 from proprio_mllm.planners.chat.dag_plan.hands import EMPTY, Capacity, Hands
 from proprio_mllm.planners.chat.dag_plan.names import Vocabulary
 
-__all__ = ["KINDS", "GraphError", "check_graph"]
-
 #: Largest graph that is looked at.
 _LARGEST: Final = 60
 #: The actions of each type of node.

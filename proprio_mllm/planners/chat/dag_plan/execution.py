@@ -25,8 +25,6 @@ from proprio_mllm.planners.chat.dag_plan.names import bindings
 from proprio_mllm.planners.chat.dag_plan.scheduler import Job, Scheduler, Situation
 from proprio_mllm.planners.chat.dag_plan.search import Search
 
-__all__ = ["Execution"]
-
 _DONE: Final = PlanStep((Action("Done"),))
 #: Codes of an effect that is there already.
 _HOLDS: Final = (FailureCode.ALREADY_IN_STATE, FailureCode.NOT_DIRTY, FailureCode.ALREADY_HELD)

@@ -17,8 +17,6 @@ from interface.actions import ActionKind
 from interface.bodies import Arm
 from interface.steps import Action
 
-__all__ = ["Graph", "GraphReply", "Node", "NodeKind", "NodeReply", "RevisedGraph"]
-
 #: occupy: the hand is full afterwards; release: it is empty again; tool-use: it works with what it holds; operate: it is empty
 #: before and after, or the body moves; complete: the task ends.
 NodeKind = Literal["occupy", "release", "tool-use", "operate", "complete"]

@@ -12,8 +12,6 @@ from typing import Final
 from interface.bodies import Arm
 from proprio_mllm.planners.chat.dag_plan.graph import Graph, Node
 
-__all__ = ["ARMS", "BLOCKED", "EMPTY", "Capacity", "Hands", "after", "arms_for", "held_by"]
-
 #: What the right and the left hand hold; an object in both is held by both together.
 Hands = tuple[str | None, str | None]
 

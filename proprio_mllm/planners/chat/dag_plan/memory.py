@@ -12,8 +12,6 @@ from interface.bodies import Arm
 from interface.observation import Observation
 from proprio_mllm.planners.chat.dag_plan.hands import ARMS, Hands
 
-__all__ = ["Memory"]
-
 
 class Memory:
     """What an episode has shown, whatever graph is carried out.

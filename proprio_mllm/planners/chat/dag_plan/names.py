@@ -16,8 +16,6 @@ from proprio_mllm.planners.furniture import FIXTURES
 from proprio_mllm.planners.scripted.instruction import TOOLS
 from proprio_mllm.planners.scripted.words import candidates, find_mentions, type_of
 
-__all__ = ["Vocabulary", "bindings"]
-
 #: Types of tools, which a task need not name.
 _TOOLS: Final = frozenset(name for names in TOOLS.values() for name in names)
 

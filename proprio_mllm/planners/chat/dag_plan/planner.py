@@ -37,8 +37,6 @@ from proprio_mllm.planners.chat.replies import ReplyError
 from proprio_mllm.planners.chat.view import encoded
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 
-__all__ = ["DagPlanner"]
-
 #: Purpose of the call that mends a graph.
 _REPAIR = "repair"
 

@@ -17,8 +17,6 @@ from proprio_mllm.planners.chat.options import ChatOptions
 from proprio_mllm.planners.chat.reflection import Seen, changed_text, completed_steps, failed_text
 from proprio_mllm.planners.chat.view import scene_text
 
-__all__ = ["GRAPH_FORM", "GRAPH_RULES", "REVISED_FORM", "failure_text", "graph_text", "mending_text"]
-
 _OPERATE: Final = ", ".join(name for name in KINDS["operate"] if ACTIONS[name].arms == 1 and ACTIONS[name].takes_object)
 GRAPH_RULES: Final = f"""\
 Write what has to be done as a graph. A scheduler carries it out with both arms, at the same time where it can: it chooses the

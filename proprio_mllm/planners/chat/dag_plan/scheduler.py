@@ -26,8 +26,6 @@ from interface.bodies import Arm
 from proprio_mllm.planners.chat.dag_plan.graph import Graph, Node
 from proprio_mllm.planners.chat.dag_plan.hands import ARMS, BLOCKED, EMPTY, Capacity, Hands, after, arms_for
 
-__all__ = ["Job", "Scheduler", "Situation"]
-
 _SHORT: Final = 0.5
 #: What needs an empty hand comes before what fills one, and hands are filled before a walk to put down.
 _TURN: Final = {"occupy": 0.125, "release": 0.25}

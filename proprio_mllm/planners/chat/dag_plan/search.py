@@ -18,8 +18,6 @@ from interface.steps import Action
 from proprio_mllm.planners.furniture import CONTAINERS, SEATS, SURFACES
 from proprio_mllm.planners.scripted.words import candidates, find_mentions, type_of
 
-__all__ = ["Search"]
-
 #: How the robot looks around where a thing is said to be.
 _LOOKS: Final = (Action("RotateLeft", amount=45.0), Action("RotateRight", amount=90.0))
 
