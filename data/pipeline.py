@@ -35,7 +35,7 @@ from interface.motion import Motion
 from robots.spec import load_robot
 
 #: Raised when the same configuration gives other shards than before.
-_VERSION: Final = 1
+_VERSION: Final = 2
 #: Fields that do not decide what is in the shards.
 _NOT_CONTENT: Final = ("workers", "path", "body_models", "scheduler", "ray_address")
 
