@@ -70,10 +70,12 @@ def _progress(name: str) -> Callable[[int, int], None]:
 
 def run(cfg: TrainConfig) -> dict[str, Any]:
     """Runs the asked stages; returns the metrics of those that ran."""
+    from proprio_mllm.training.processes import first_alone
+
     if cfg.stage in ("all", "data"):
-        make_data(cfg)
+        first_alone(lambda: make_data(cfg))
     if cfg.stage in ("all", "collect"):
-        make_shards(cfg)
+        first_alone(lambda: make_shards(cfg))
     if cfg.stage in ("data", "collect"):
         return {}
     import torch
@@ -95,7 +97,7 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
         from proprio_mllm.training.release import export
 
         try:
-            export(pipeline, cfg.release)
+            first_alone(lambda: export(pipeline, cfg.release or ""))
         except ValueError as error:
             raise StageError(str(error)) from error
     return metrics
@@ -117,7 +119,8 @@ def _dagger(*args: Any, **kwargs: Any) -> Any:
 
 def job(cfg: TrainConfig) -> int:
     """Runs one configuration; 0 on success, 1 when an input is missing or damaged, or nothing can be written."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    level = logging.INFO if os.environ.get("RANK", "0") == "0" else logging.WARNING
+    logging.basicConfig(level=level, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     for noisy in ("httpx", "datasets", "filelock", "OpenGL"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
     from data.files import DamagedFileError

@@ -241,6 +241,7 @@ class TrainConfig:
         output: folder of all outputs.
         seed: seed of data order, initial weights and rollouts.
         threads: torch threads; 0 leaves torch's choice.
+        micro_batches: into how many each step's batch is cut, to save memory or to be shared by processes; a multiple of these.
         overwrite: run a stage from its start although its output is current, or a checkpoint is there.
         release: folder the finished stages are exported to, None for no export.
         resume: continue an interrupted stage from its checkpoint.
@@ -264,9 +265,11 @@ class TrainConfig:
     output: str = "outputs"
     seed: int = 0
     threads: int = 2
+    micro_batches: int = 1
     overwrite: bool = False
     release: str | None = None
     resume: bool = True
 
     def __post_init__(self) -> None:
         require(0 <= self.seed <= LARGEST_SEED, f"seed {self.seed} outside [0, {LARGEST_SEED}]")
+        require(self.micro_batches >= 1, f"micro_batches {self.micro_batches} must be at least 1")

@@ -120,6 +120,7 @@ class Batch(Movable):
         position_ids: (3, B, S).
         labels: (B, S), -100 where nothing is learnt.
         images: the images of all rows in order, or None.
+        out_of: supervised tokens of the whole batch of which it is a part, 0 where it is one by itself.
     """
 
     input_ids: Tensor
@@ -127,6 +128,7 @@ class Batch(Movable):
     position_ids: Tensor
     labels: Tensor
     images: ImageBatch | None = None
+    out_of: int = 0
 
     def then(self, tokens: Tensor) -> Batch:
         """More text (B, K) after each left-padded row, where a cache holds the rows."""
@@ -194,7 +196,7 @@ class Collator:
     def in_parts(self, examples: Sequence[Example], count: int = 3) -> tuple[Batch, ...]:
         """A training batch as a few batches of rows of similar length, so that little is computed on padding.
 
-        The model's loss on the tuple is that of the whole batch.
+        The losses of the parts add up to that of the whole batch.
 
         Args:
             examples: conversations.
@@ -203,7 +205,9 @@ class Collator:
         ordered = sorted(examples, key=lambda example: example.length)
         count = max(1, min(count, len(ordered) // 2))
         cuts = [len(ordered) * number // count for number in range(count + 1)]
-        return tuple(self(ordered[first:end]) for first, end in pairwise(cuts))
+        parts = [self(ordered[first:end]) for first, end in pairwise(cuts)]
+        whole = sum(part.supervised for part in parts)
+        return tuple(replace(part, out_of=whole) for part in parts)
 
     def __call__(
         self, examples: Sequence[Example], generation: bool = False, padding: Literal["left", "right"] | None = None

@@ -2,7 +2,7 @@
 
 The wrapper computes the visual tokens, passes them through the CSE and the additive MPE, and gives them to the model as
 `mm_encoder_outputs` together with position ids from the collator. With `mpe.mode=mrope` and `cse.enabled=false` the result is
-the base model's, bit for bit. The wrapper must be the outermost module under DDP.
+the base model's, bit for bit.
 
 Shape letters: B batch, S sequence, I images, N visual tokens per image, D hidden size, V vocabulary.
 """
@@ -147,18 +147,13 @@ class ProprioMLLM(nn.Module):
         inputs["mm_encoder_outputs"] = {"image": BaseModelOutputWithPooling(pooler_output=per_image)}
         return inputs, visual
 
-    def forward(self, batch: Batch | tuple[Batch, ...], return_logits: bool = False) -> ModelOutput:
-        """Loss of a batch.
+    def forward(self, batch: Batch, return_logits: bool = False) -> ModelOutput:
+        """Loss of a batch; of a part of one, what it adds to the whole batch's.
 
         Args:
-            batch: from the collator, or its parts; the loss of parts is that of the batch they make up.
-            return_logits: also compute the logits of every position; not of parts.
+            batch: from the collator.
+            return_logits: also compute the logits of every position.
         """
-        if isinstance(batch, tuple):
-            outs = [self.forward(part) for part in batch]
-            count = sum(out.supervised for out in outs)
-            loss = torch.stack([out.loss * (out.supervised / max(count, 1)) for out in outs]).sum()
-            return ModelOutput(loss, count, sum(out.correct for out in outs), None)
         inputs, visual = self._inputs(batch)
         if bool((batch.attention_mask.diff(dim=1) <= 0).all()):
             # Padding stands right of every token, where causal attention never looks: no mask, and the fast kernel.
@@ -170,7 +165,7 @@ class ProprioMLLM(nn.Module):
         picked = target[chosen]
         count = int(picked.numel())
         logits = self.core.lm_head(hidden[:, :-1][chosen]).float()  # (targets, V)
-        loss = functional.cross_entropy(logits, picked, reduction="sum") / max(count, 1)
+        loss = functional.cross_entropy(logits, picked, reduction="sum") / max(batch.out_of or count, 1)
         correct = int((logits.detach().argmax(-1) == picked).sum()) if count else 0
         everything = self.core.lm_head(hidden) if return_logits else None
         return ModelOutput(loss, count, correct, visual, everything)

@@ -35,7 +35,7 @@ from proprio_mllm.model.prompts import Style, body_state_prompt, described_motio
 from proprio_mllm.training.asking import answer_shares
 from proprio_mllm.training.base import EPISODE_ROWS
 from proprio_mllm.training.judging import judge_example
-from proprio_mllm.training.loop import Parts
+from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.phrases import body_state_words
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views, grips_of
 from proprio_mllm.training.turns import Turns
@@ -90,11 +90,11 @@ class AlignmentData:
     def _encode(self, windows: NDArray[np.float32]) -> list[list[int]]:
         return self.tokenizer.encode(torch.from_numpy(windows).to(self.tokenizer.mean.device)).tolist()
 
-    def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> tuple[Batch, ...] | Parts:
+    def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> Parts:
         """A batch of one kind from the training rows, in parts."""
         if kind == "text":
             return self.words.batch(rng, max(1, size // EPISODE_ROWS))
-        return self._collator.in_parts(self._examples(kind, rng, size))
+        return Parts((kind, part) for part in self._collator.in_parts(self._examples(kind, rng, size)))
 
     def _examples(self, kind: Kind, rng: np.random.Generator, size: int) -> list[Example]:
         if kind == "plan":
@@ -173,7 +173,7 @@ def body_state_accuracy(model: ProprioMLLM, demos: Demos, codes: NDArray[np.int6
     return result
 
 
-class AlignmentObjective:
+class AlignmentObjective(Objective):
     """One phase."""
 
     def __init__(self, model: ProprioMLLM, data: AlignmentData, phase: str, cfg: AlignmentConfig, key: str) -> None:
@@ -186,22 +186,28 @@ class AlignmentObjective:
         self._data, self._cfg = data, cfg
         self._kinds: tuple[Kind, ...] = kinds if model.cfg.proprioception else ("body", "plan")
 
-    def batch(self, rng: np.random.Generator, size: int) -> tuple[Kind, tuple[Batch, ...]] | Parts:
-        """A batch of one kind, drawn anew each step."""
+    def kind(self, rng: np.random.Generator) -> Kind:
+        """Drawn anew each step."""
         others: tuple[Kind, ...] = tuple(kind for kind in self._kinds if kind != "plan")
         if "plan" in self._kinds and rng.random() < self._cfg.plan_share:
-            kind: Kind = "text" if rng.random() < self._cfg.text_share else "plan"
-        else:
-            kind = others[int(rng.integers(len(others)))]
-        made = self._data.batch(kind, rng, size)
-        return made if isinstance(made, Parts) else (kind, made)
+            return "text" if rng.random() < self._cfg.text_share else "plan"
+        return others[int(rng.integers(len(others)))]
+
+    def batch(self, rng: np.random.Generator, size: int, kind: Kind) -> Parts:
+        """A batch of a kind."""
+        return self._data.batch(kind, rng, size)
+
+    def weight(self, batch: Parts) -> float:
+        """Tokens of the answers."""
+        first = batch[0]
+        return float(first.answers if isinstance(first, WordBatch) else first[1].out_of)
 
     def loss(
-        self, module: nn.Module, batch: tuple[Kind, tuple[Batch, ...]] | WordBatch, generator: torch.Generator
+        self, module: nn.Module, batch: tuple[Kind, Batch] | WordBatch, generator: torch.Generator
     ) -> tuple[Tensor, Mapping[str, float]]:
         """Cross-entropy over the answers; nothing is drawn."""
         if isinstance(batch, WordBatch):
             return self._data.words.loss(module, batch, generator)
         kind, inputs = batch
         out = module(inputs)
-        return out.loss, {f"{kind}_loss": float(out.loss.detach()), f"{kind}_accuracy": out.correct / max(out.supervised, 1)}
+        return out.loss, {f"{kind}_loss": float(out.loss.detach()), f"{kind}_accuracy": out.correct / max(inputs.out_of, 1)}

@@ -23,7 +23,7 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
 from proprio_mllm.training.asking import answer_shares
 from proprio_mllm.training.judging import judge_example
-from proprio_mllm.training.loop import Parts
+from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views
 from proprio_mllm.training.turns import Turns
@@ -49,7 +49,7 @@ class _WithDense(nn.Module):
         if batch.text is not None:
             out = self.model(batch.text)
             total = out.loss
-            accuracy = out.correct / max(out.supervised, 1)
+            accuracy = out.correct / max(batch.text.out_of or out.supervised, 1)
             values |= {f"{batch.kind}_loss": float(out.loss.detach()), f"{batch.kind}_accuracy": accuracy}
             visual = out.visual
         else:
@@ -64,20 +64,24 @@ class _WithDense(nn.Module):
         return total, values
 
 
+_JointKind = Literal["look", "words", "plan", "judge"]
+
+
 @dataclass(frozen=True, slots=True)
 class _JointBatch(Movable):
     kind: Literal["dense", "look", "plan", "judge"]
-    text: Batch | tuple[Batch, ...] | None
+    text: Batch | None
     images: ImageBatch | None
     dense: DenseTargets | None
     dense_weight: float
 
 
-class _Base:
+class _Base(Objective):
     """What both objectives share: the sources and the assembly of view batches."""
 
     def __init__(self, model: ProprioMLLM, head: DenseHead, views: Views, cfg: BaseConfig, key: str) -> None:
-        self.module = _WithDense(model, head)
+        self.module: nn.Module = _WithDense(model, head)
+        self._model = model
         self.key = key
         self._views, self._cfg = views, cfg
         self._collator = Collator(model.processor, model.cfg)
@@ -112,7 +116,7 @@ class DenseObjective(_Base):
 
     name = "base/dense"
 
-    def batch(self, rng: np.random.Generator, size: int) -> _JointBatch:
+    def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> _JointBatch:
         """Views with their dense truth."""
         return self._view_batch(rng, size, 0)
 
@@ -149,26 +153,44 @@ class JointObjective(_Base):
         super().__init__(model, head, views, cfg, key)
         self._turns, self._demos, self._clips, self._words = turns, demos, clips, words
 
-    def batch(self, rng: np.random.Generator, size: int) -> _JointBatch | Parts:
-        """A batch of views, of judging questions and phrases, of episodes in words, or of decisions."""
+    def kind(self, rng: np.random.Generator) -> _JointKind:
+        """Views, episodes in words, decisions, or judging questions and phrases."""
         if rng.random() >= self._cfg.plan_share:
-            return self._view_batch(rng, size, self._cfg.questions)
+            return "look"
         if rng.random() < self._cfg.text_share:
+            return "words"
+        return "plan" if rng.random() >= self._cfg.judge_share else "judge"
+
+    def batch(self, rng: np.random.Generator, size: int, kind: _JointKind) -> _JointBatch | Parts:
+        """A batch of a kind."""
+        if kind == "look":
+            return self._view_batch(rng, size, self._cfg.questions)
+        if kind == "words":
             return self._words.batch(rng, max(1, size // EPISODE_ROWS))
-        if rng.random() >= self._cfg.judge_share:
-            return _JointBatch("plan", self._collator.in_parts(self._turns.draw(rng, size)), None, None, 0.0)
+        if kind == "plan":
+            return self._parts(kind, self._turns.draw(rng, size))
         examples = [
             phrase(self._clips, rng, self._demos.style) if rng.random() < PHRASES else judge_example(self._demos, i, rng, None)
             for i in self._demos.draw(rng, size)
         ]
-        return _JointBatch("judge", self._collator.in_parts(examples), None, None, 0.0)
+        return self._parts(kind, examples)
+
+    def _parts(self, kind: Literal["plan", "judge"], examples: Sequence[Example]) -> Parts:
+        return Parts(_JointBatch(kind, part, None, None, 0.0) for part in self._collator.in_parts(examples))
+
+    def weight(self, batch: _JointBatch | Parts) -> float:
+        """Tokens of the answers; views count alike, as most of their loss is dense."""
+        if isinstance(batch, _JointBatch):
+            return 1.0
+        first = batch[0]
+        return float(first.answers if isinstance(first, WordBatch) else first.text.out_of)
 
     def loss(
         self, module: nn.Module, batch: _JointBatch | WordBatch, generator: torch.Generator
     ) -> tuple[Tensor, Mapping[str, float]]:
         """Loss of one batch, or of one part of episodes in words; nothing is drawn."""
         if isinstance(batch, WordBatch):
-            return self._words.loss(self.module.model, batch, generator)
+            return self._words.loss(self._model, batch, generator)
         return super().loss(module, batch, generator)
 
 

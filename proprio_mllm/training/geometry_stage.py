@@ -13,10 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from proprio_mllm.model.point_map import point_map_loss
+from proprio_mllm.training.loop import Objective
 from proprio_mllm.training.sources import Views
 
 
-class PointMapObjective:
+class PointMapObjective(Objective):
     """Confidence-weighted point regression on views."""
 
     name = "pointmap"
@@ -26,7 +27,7 @@ class PointMapObjective:
         self.key = key
         self._views = views
 
-    def batch(self, rng: np.random.Generator, size: int) -> tuple[Tensor, Tensor]:
+    def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> tuple[Tensor, Tensor]:
         """Images (I, 3, H, W) and true points (I, H, W, 3)."""
         return _stack(self._views, rng.choice(self._views.split.train, size))
 

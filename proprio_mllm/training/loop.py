@@ -1,8 +1,9 @@
 """The one training loop: seeded batches, AdamW or Muon, cosine schedule, checkpoints, metrics, progress with time left.
 
-A stage gives an `Objective`: which module trains, the batch of a step, and its loss. The batch of a step is a function of
-(seed, step, process) only, so a run that is killed and resumed ends with the same weights as one that was not. accelerate
-places the module and averages gradients over processes; on one CPU it adds nothing.
+A stage gives an `Objective`: which module trains, the batches of a step, and their loss. A step's batch may be cut into
+micro-batches, whose gradients are added: one process takes them in turn, several processes share them. A micro-batch is a
+function of (seed, step, its number) alone, so a run that is killed and resumed, by as many processes or by others, ends with
+the same weights as one that was not, up to rounding where sums are taken in another order.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from accelerate import Accelerator
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -26,28 +26,35 @@ from configs.schema.train import LoopConfig
 from proprio_mllm.training.checkpoint import load_checkpoint, save_checkpoint
 from proprio_mllm.training.metrics import MetricWriter
 from proprio_mllm.training.muon import Muon, linear_weights
+from proprio_mllm.training.processes import add_gradients, added, first_alone, from_first, processes, same_everywhere
 
 logger = logging.getLogger(__name__)
 
 
 class Objective(Protocol):
-    """What a stage trains."""
+    """What a stage trains; the methods with a body are for those whose micro-batches are all alike."""
 
     name: str
     #: Identifies data and configuration; a checkpoint of another key is not resumed.
     key: str
 
-    @property
-    def module(self) -> nn.Module:
-        """The module whose parameters with `requires_grad` are trained; called on batches by `loss`."""
+    #: Its parameters with `requires_grad` are trained; called on batches by `loss`.
+    module: nn.Module
+
+    def kind(self, rng: np.random.Generator) -> Any:
+        """Of what kind all micro-batches of a step are, so that all processes have the same work."""
+        return None
+
+    def batch(self, rng: np.random.Generator, size: int, kind: Any) -> Any:
+        """A micro-batch on the CPU; must depend on `rng` and `kind` alone."""
         ...
 
-    def batch(self, rng: np.random.Generator, size: int) -> Any:
-        """A batch on the CPU; must depend on `rng` alone."""
-        ...
+    def weight(self, batch: Any) -> float:
+        """What a micro-batch counts in the mean over a step: how many tokens it teaches, or 1 where all teach the same."""
+        return 1.0
 
     def loss(self, module: nn.Module, batch: Any, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
-        """Loss and metrics of a batch through `module` (possibly wrapped for several processes)."""
+        """Loss and metrics of a micro-batch, or of one of its `Parts`, through `module`."""
         ...
 
 
@@ -57,7 +64,7 @@ class Parts(tuple[Any, ...]):
 
 @dataclass(frozen=True, slots=True)
 class LoopResult:
-    """What a run did: steps and seconds in all, examples of this process, and the mean of each metric over the last log."""
+    """What a run did: steps and seconds in all, examples of all processes, and the mean of each metric over the last log."""
 
     steps: int
     seconds: float
@@ -101,29 +108,55 @@ def make_optimizer(module: nn.Module, cfg: LoopConfig) -> torch.optim.Optimizer:
 
 
 def run_loop(
-    objective: Objective, cfg: LoopConfig, folder: Path, seed: int, writer: MetricWriter, resume: bool = True
+    objective: Objective,
+    cfg: LoopConfig,
+    folder: Path,
+    seed: int,
+    writer: MetricWriter | None,
+    resume: bool = True,
+    micro_batches: int = 1,
 ) -> LoopResult:
     """Trains an objective to `cfg.steps` or for `cfg.minutes`, resuming from `folder/checkpoint` when it is of the same run.
 
+    Args:
+        objective: what trains.
+        cfg: steps, batch, optimiser.
+        folder: of the checkpoint.
+        seed: of all draws.
+        writer: takes the metrics, those of the first process but for the loss; None in the other processes.
+        resume: whether an earlier checkpoint is continued.
+        micro_batches: into how many a step's batch is cut.
+
     Raises:
         FloatingPointError: when the loss is not finite; the message names stage and step.
+        ValueError: when nothing trains, or the batch cannot be cut or shared like that.
     """
-    accelerator = Accelerator(cpu=not torch.cuda.is_available())
-    source = objective.module
-    trained = [parameter for parameter in source.parameters() if parameter.requires_grad]
+    state = processes()
+    device = state.device
+    assert device is not None
+    rank, count = state.process_index, state.num_processes
+    if micro_batches % count or cfg.batch % micro_batches:
+        raise ValueError(
+            f"{objective.name}: a batch of {cfg.batch} in micro_batches={micro_batches} cannot be shared by {count} processes; "
+            "micro_batches must be a multiple of the processes and a divisor of the batch"
+        )
+    module = objective.module.to(device)
+    trained = [parameter for parameter in module.parameters() if parameter.requires_grad]
     if not trained:
         raise ValueError(f"stage {objective.name!r} trains no parameter")
-    optimizer = make_optimizer(source, cfg)
-    module, prepared = accelerator.prepare(source, optimizer)
+    optimizer = make_optimizer(module, cfg)
     checkpoint = folder / "checkpoint"
-    first, spent = load_checkpoint(checkpoint, source, optimizer, objective.key) if resume else (0, 0.0)
-    writer.discard_after(first)
-    rank = accelerator.process_index
+    first, spent = load_checkpoint(checkpoint, module, optimizer, objective.key) if resume else (0, 0.0)
+    same_everywhere([*trained, *module.buffers()])
+    if writer is not None:
+        writer.discard_after(first)
     if first:
         logger.info("%s: resumed at step %d of %d", objective.name, first, cfg.steps)
 
-    def make(step: int) -> Any:
-        return objective.batch(np.random.default_rng([seed, step, rank]), cfg.batch)
+    def make(step: int) -> list[Any]:
+        streams = [np.random.default_rng([seed, step, number]) for number in range(micro_batches)]
+        kind = objective.kind(streams[0] if rank == 0 else np.random.default_rng([seed, step, 0]))
+        return [objective.batch(stream, cfg.batch // micro_batches, kind) for stream in streams[rank::count]]
 
     began, sums, counted, last = time.monotonic(), dict[str, float](), 0, dict[str, float]()
     module.train()
@@ -131,33 +164,39 @@ def run_loop(
         ThreadPoolExecutor(1) as pool,
         tqdm(total=cfg.steps, initial=first, desc=objective.name, mininterval=5.0, disable=rank > 0) as bar,
     ):
-        ahead: Future[Any] | None = pool.submit(make, first) if first < cfg.steps else None
+        ahead: Future[list[Any]] | None = pool.submit(make, first) if first < cfg.steps else None
         for step in range(first, cfg.steps):
             assert ahead is not None
-            batch = ahead.result()
-            seconds = spent + time.monotonic() - began
+            batches = ahead.result()
+            (seconds,) = from_first([spent + time.monotonic() - began])
             out_of_time = bool(cfg.minutes) and seconds > 60.0 * cfg.minutes
             ahead = pool.submit(make, step + 1) if step + 1 < cfg.steps else None
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate(cfg, step, seconds)
-            draw_seed = (seed * 1_000_003 + step) * 64 + rank
-            generator = torch.Generator().manual_seed(draw_seed)
-            torch.manual_seed(draw_seed)  # dropout draws from torch's own
+            weights = [objective.weight(batch) for batch in batches]
+            (whole,) = added([sum(weights)])
             found: dict[str, float] = {}
-            for part in batch if isinstance(batch, Parts) else (batch,):
-                with torch.autocast(accelerator.device.type, torch.bfloat16, enabled=cfg.precision == "bf16"):
-                    loss, values = objective.loss(module, _moved(part, accelerator.device), generator)
-                if not bool(torch.isfinite(loss)):
-                    raise FloatingPointError(
-                        f"{objective.name}: loss {float(loss.detach())} at step {step}; lower lr ({cfg.lr})"
-                    )
-                accelerator.backward(loss)
-                for name, value in {"loss": float(loss.detach()), **values}.items():
-                    found[name] = found.get(name, 0.0) + value
-            norm = accelerator.clip_grad_norm_(trained, cfg.clip)
-            prepared.step()
-            prepared.zero_grad(set_to_none=True)
-            for name, value in {**found, "grad_norm": float(norm or 0.0)}.items():
+            for number, (batch, weight) in enumerate(zip(batches, weights, strict=True)):
+                draw_seed = (seed * 1_000_003 + step) * 64 + rank + number * count
+                generator = torch.Generator().manual_seed(draw_seed)
+                torch.manual_seed(draw_seed)  # dropout draws from torch's own
+                share = weight / whole if whole else 0.0
+                for part in batch if isinstance(batch, Parts) else (batch,):
+                    with torch.autocast(device.type, torch.bfloat16, enabled=cfg.precision == "bf16"):
+                        loss, values = objective.loss(module, _moved(part, device), generator)
+                    (loss * share).backward()
+                    found["loss"] = found.get("loss", 0.0) + float(loss.detach()) * share
+                    for name, value in values.items():
+                        found[name] = found.get(name, 0.0) + value / len(batches)
+            (found["loss"],) = added([found["loss"]])
+            if not math.isfinite(found["loss"]):
+                raise FloatingPointError(f"{objective.name}: loss {found['loss']} at step {step}; lower lr ({cfg.lr})")
+            add_gradients(trained)
+            norm = nn.utils.clip_grad_norm_(trained, cfg.clip)
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+            same_everywhere(list(module.buffers()))  # codes that are learnt without gradients
+            for name, value in {**found, "grad_norm": float(norm)}.items():
                 sums[name] = sums.get(name, 0.0) + value
                 sums[f"#{name}"] = sums.get(f"#{name}", 0.0) + 1.0
             counted += 1
@@ -168,12 +207,13 @@ def run_loop(
                 last = {name: total / sums[f"#{name}"] for name, total in sums.items() if not name.startswith("#")}
                 last["lr"] = learning_rate(cfg, step, seconds)
                 last["examples_per_s"] = counted * cfg.batch / max(time.monotonic() - began, 1e-9)
-                if accelerator.is_main_process:
+                if writer is not None:
                     writer.write(done, last)
                 bar.set_postfix(loss=f"{last['loss']:.3f}", refresh=False)
                 sums = {}
-            if (done % cfg.checkpoint_every == 0 or final) and accelerator.is_main_process:
-                save_checkpoint(checkpoint, done, source, optimizer, objective.key, spent + time.monotonic() - began)
+            if done % cfg.checkpoint_every == 0 or final:
+                taken = spent + time.monotonic() - began
+                first_alone(lambda: save_checkpoint(checkpoint, done, module, optimizer, objective.key, taken))  # noqa: B023
             if final:
                 break
     module.eval()

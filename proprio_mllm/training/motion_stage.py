@@ -22,6 +22,7 @@ from configs.schema.model import MotionTokenizerConfig
 from data.motion import FPS, HAND_OPENING, KEY_BODY_COUNT, N_FEATURES, OPEN_HAND, PELVIS_HEIGHT
 from interface.bodies import KEY_BODIES
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.training.loop import Objective
 from proprio_mllm.training.posture import in_other_postures
 from proprio_mllm.training.sources import Clips, held_out
 
@@ -85,7 +86,7 @@ class MotionWindows:
         return mean.astype(np.float32), (np.sqrt(square) / FEATURE_BIAS).astype(np.float32)
 
 
-class MotionObjective:
+class MotionObjective(Objective):
     """Reconstruction, codebook and commitment loss (paper, Eq. 2)."""
 
     name = "tokenizer"
@@ -95,7 +96,7 @@ class MotionObjective:
         self.key = key
         self._windows = windows
 
-    def batch(self, rng: np.random.Generator, size: int) -> Tensor:
+    def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> Tensor:
         """Windows (B, T, F)."""
         return torch.from_numpy(self._windows.draw_varied(rng, size))
 

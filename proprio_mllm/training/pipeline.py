@@ -19,6 +19,7 @@ from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.loop import Objective, run_loop
 from proprio_mllm.training.metrics import MetricWriter
 from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_key
+from proprio_mllm.training.processes import first_alone, from_first, processes
 from proprio_mllm.training.sources import shard_hash
 
 logger = logging.getLogger(__name__)
@@ -168,6 +169,7 @@ class Pipeline:
         inputs = {needed: self.key(needed) for needed in stage.needs}
         inputs |= {kind: shard_hash(self.paths.shards(kind)) for kind in stage.shards}
         settings = dict(stage.settings(self)) | ({"recipe": stage.recipe} if stage.recipe else {})
+        settings |= {"micro_batches": self.cfg.micro_batches} if self.cfg.micro_batches > 1 else {}
         return stage_key(settings, self.cfg.seed, inputs)
 
     def ancestors(self, name: str) -> tuple[str, ...]:
@@ -193,19 +195,19 @@ class Pipeline:
             StageError: when a stage that it needs has no current output.
         """
         folder, key = self.paths.stage(name), self.key(name)
-        if finished_key(folder) == key and not self.cfg.overwrite:
+        (current,) = from_first([float(finished_key(folder) == key and not self.cfg.overwrite)])
+        if current:
             logger.info("%s: current, skipped (%s)", name, folder)
             return None
         for needed in self.stages[name].needs:
             if not self.is_current(needed):
                 raise StageError(f"stage {name!r} needs the output of {needed!r}; run `python train.py stage={needed}` first")
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "done.json").unlink(missing_ok=True)  # from here on the folder's content is no finished stage's
+        first_alone(lambda: _unfinished(folder))
         began = time.monotonic()
         self._taken.clear()
         metrics = self.stages[name].run(self, folder, key) | self._taken
         metrics["seconds"] = round(time.monotonic() - began, 1)
-        finish(folder, key, metrics, self.command)
+        first_alone(lambda: finish(folder, key, metrics, self.command))
         logger.info("%s: %s", name, ", ".join(f"{k} {v:.4g}" for k, v in metrics.items()))
         return metrics
 
@@ -218,13 +220,22 @@ class Pipeline:
 
     def loop(self, objective: Objective, cfg: LoopConfig, folder: Path) -> None:
         """Runs one objective with this configuration's seed and logger."""
-        folder.mkdir(parents=True, exist_ok=True)
-        writer = MetricWriter(folder, objective.name, self.cfg.logger, {"key": objective.key})
+        first_alone(lambda: folder.mkdir(parents=True, exist_ok=True))
+        about = {"key": objective.key}
+        writer = MetricWriter(folder, objective.name, self.cfg.logger, about) if processes().is_main_process else None
+        resume = self.cfg.resume and not self.cfg.overwrite
         try:
-            result = run_loop(objective, cfg, folder, self.cfg.seed, writer, self.cfg.resume and not self.cfg.overwrite)
+            result = run_loop(objective, cfg, folder, self.cfg.seed, writer, resume, self.cfg.micro_batches)
             self._taken |= {
                 f"{objective.name}/steps": float(result.steps),
                 f"{objective.name}/seconds": round(result.seconds, 1),
             }
         finally:
-            writer.close()
+            if writer is not None:
+                writer.close()
+
+
+def _unfinished(folder: Path) -> None:
+    """From here on the folder's content is no finished stage's."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "done.json").unlink(missing_ok=True)

@@ -22,7 +22,7 @@ from proprio_mllm.model.branches import Branches, read_branches
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.word_tokens import Tokens, first_word, tokens_of
 from proprio_mllm.model.wording import WordEpisode
-from proprio_mllm.training.loop import Parts
+from proprio_mllm.training.loop import Objective, Parts
 
 #: The episode of a seed.
 Source = Callable[[int], WordEpisode]
@@ -179,7 +179,7 @@ def mixed(rest: Source, *others: tuple[float, Source]) -> Source:
     return episode
 
 
-class WordsObjective:
+class WordsObjective(Objective):
     """Episodes drawn anew in every batch.
 
     Args:
@@ -192,20 +192,17 @@ class WordsObjective:
     name = "words"
 
     def __init__(self, model: ProprioMLLM, episode: Source, key: str, reading: float = 0.0) -> None:
-        self.model, self._episode, self.key, self._reading = model, episode, key, reading
+        self.module: nn.Module = model
+        self._episode, self.key, self._reading = episode, key, reading
+        self._tokenizer = model.processor.tokenizer
         self._pad = int(model.processor.tokenizer.pad_token_id)
 
-    @property
-    def module(self) -> nn.Module:
-        """The whole model."""
-        return self.model
-
-    def batch(self, rng: np.random.Generator, size: int) -> Parts:
+    def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> Parts:
         """Rows of `size` episodes in parts of few shapes; what does not fill a part is left out where others do."""
         rows: list[_Row] = []
         for _ in range(size):
             episode = self._episode(int(rng.integers(2**62)))
-            rows += rows_of(episode, tokens_of(self.model.processor.tokenizer, rng))
+            rows += rows_of(episode, tokens_of(self._tokenizer, rng))
         shapes: dict[tuple[int, int], list[_Row]] = {}
         for row in rows:
             shapes.setdefault(row.shape, []).append(row)
@@ -218,6 +215,10 @@ class WordsObjective:
         answers = sum(int((part.labels != IGNORE).sum()) for part in made)
         decisions = sum(int(_learnt(part).any(-1).sum()) for part in made)
         return Parts(replace(part, answers=answers, decisions=decisions, parts=len(made)) for part in made)
+
+    def weight(self, batch: Parts) -> float:
+        """Tokens of the answers."""
+        return float(batch[0].answers)
 
     def loss(self, module: nn.Module, batch: WordBatch, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
         """A part's contribution to the mean over the answers' tokens, and to the share of decisions that are all right."""

@@ -9,7 +9,7 @@ import pytest
 
 from interface.episode import Outcome
 from interface.failures import FailureCategory
-from proprio_mllm.evaluation.episode import Limits, run_episode
+from proprio_mllm.evaluation.episode import GoalReport, Limits, run_episode
 from proprio_mllm.evaluation.ledger import Ledger, read_ledger
 from proprio_mllm.planners.protocol import Usage
 
@@ -30,6 +30,14 @@ def test_success_ends_the_episode_and_is_counted(session, scripted, fields) -> N
     assert record.goal_conditions_met == 1.0
     assert not record.budget_exhausted
     assert [step["step"] for step in record.trace] == list(SOLVED)
+
+
+def test_half_of_the_goals_is_no_success(session, scripted, fields, monkeypatch) -> None:
+    half = session()
+    monkeypatch.setattr(half, "goals", lambda: GoalReport((True, half.held), frozenset({"Mug_1"})))
+    record = play(half, scripted("GoTo(Mug_1)"), fields)
+    assert record.outcome is Outcome.FAILURE and record.failure is not None and not record.in_time
+    assert record.goal_conditions_met == 0.5
 
 
 def test_the_runner_owns_history_step_and_budget(session, scripted, fields) -> None:

@@ -3,13 +3,21 @@
 import pytest
 
 from interface.failures import FAILURES, FailureCategory, FailureCode
-from interface.feedback import category_of
+from interface.feedback import ActionOutcome, Feedback, category_of
 from interface.steps import Action
 
 
 def test_every_code_has_a_meaning():
     assert set(FAILURES) == set(FailureCode)
     assert all(spec.meaning for spec in FAILURES.values())
+
+
+def test_margins_and_luck_are_not_public():
+    pick = Action.parse("Pick(left, Mug_1)")
+    outcome = ActionOutcome(pick, False, "Slipped", FailureCategory.LOGICAL, {"gap_m": 0.1}, "it slipped", "slip")
+    shown = Feedback((outcome, ActionOutcome(pick, True)), 2.0).public()
+    assert [(one.margins, one.contingency) for one in shown.outcomes] == [({}, "")] * 2 and not shown.struck
+    assert (shown.outcomes[0].code, shown.outcomes[0].message, shown.duration_s) == ("Slipped", "it slipped", 2.0)
 
 
 @pytest.mark.parametrize(

@@ -88,16 +88,19 @@ def test_parts_of_similar_length_have_the_loss_and_gradients_of_the_batch(cfg, b
     widths = [part.input_ids.shape[1] for part in parts]
     assert widths == sorted(widths)
     assert widths[0] < collate(rows).input_ids.shape[1]
-    gradients = []
-    for batch in (collate(rows), parts):
+    sums = []
+    for batches in ((collate(rows),), parts):
         model.zero_grad()
-        out = model(batch)
-        out.loss.backward()
-        gradients.append((out, [p.grad.clone() for p in model.parameters() if p.grad is not None]))
-    (whole, expected), (split, got) = gradients
-    torch.testing.assert_close(whole.loss, split.loss, atol=1e-5, rtol=1e-5)
-    assert (whole.supervised, whole.correct) == (split.supervised, split.correct)
-    torch.testing.assert_close(expected, got, atol=1e-5, rtol=1e-3)
+        outs = [model(batch) for batch in batches]
+        for out in outs:
+            out.loss.backward()
+        gradients = [p.grad.clone() for p in model.parameters() if p.grad is not None]
+        counts = sum(out.supervised for out in outs), sum(out.correct for out in outs)
+        sums.append((sum(out.loss.detach() for out in outs), counts, gradients))
+    whole, split = sums
+    assert whole[1] == split[1] and {part.out_of for part in parts} == {whole[1][0]}
+    torch.testing.assert_close(whole[0], split[0], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(whole[2], split[2], atol=1e-5, rtol=1e-3)
     assert len(collate.in_parts(examples[:1])) == 1
     moved = parts[0].to("meta")
     assert moved.input_ids.device.type == "meta"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -255,13 +256,19 @@ def correct(request: DaggerRequest, workers: int) -> None:
     writer.finish({})
 
 
+def debug_config(root: Path, more: Sequence[str] = ()) -> TrainConfig:
+    """A few steps of a small model, with outputs in a folder."""
+    words = ["budget=debug", f"output={root}", "logger.wandb=disabled", "selu.truth=oracle", *more]
+    cfg = build(TrainConfig, compose("train", words))
+    return dataclasses.replace(cfg, model=small(cfg.model))
+
+
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
     """Every stage, run once."""
     torch.set_num_threads(1)
     root = tmp_path_factory.mktemp("run")
-    cfg = build(TrainConfig, compose("train", ["budget=debug", f"output={root}", "logger.wandb=disabled", "selu.truth=oracle"]))
-    cfg = dataclasses.replace(cfg, model=small(cfg.model))
+    cfg = debug_config(root)
     (root / "tiny").mkdir()
     shutil.copytree(shards, root / "tiny" / "data")
     pipeline = Pipeline(STAGES, cfg, collect, "python train.py stage=all", correct, Lessons())

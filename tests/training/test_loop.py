@@ -17,13 +17,13 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from configs.schema.train import LoggerConfig, LoopConfig
-from proprio_mllm.training.loop import Parts, learning_rate, run_loop
+from proprio_mllm.training.loop import Objective, Parts, learning_rate, run_loop
 from proprio_mllm.training.metrics import MetricWriter
 
 CFG = LoopConfig(steps=30, batch=8, lr=1e-2, warmup=3, checkpoint_every=4, log_every=5)
 
 
-class Line:
+class Line(Objective):
     """Fits a line; the loss also draws, so that the generator's state matters."""
 
     name = "line"
@@ -33,7 +33,7 @@ class Line:
         self.module: nn.Module = nn.Sequential(nn.Linear(3, 8), nn.Tanh(), nn.Linear(8, 1))
         self.key, self.bad, self.seen = key, bad, 0
 
-    def batch(self, rng: np.random.Generator, size: int) -> Tensor:
+    def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> Tensor:
         return torch.from_numpy(rng.normal(size=(size, 3)).astype(np.float32))
 
     def loss(self, module: nn.Module, batch: Tensor, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
@@ -62,7 +62,7 @@ def test_same_seed_same_weights(tmp_path: Path) -> None:
 class InParts(Line):
     """The same line, its batches in two parts; without noise, which would be drawn for each part."""
 
-    def batch(self, rng: np.random.Generator, size: int) -> Parts:
+    def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> Parts:
         whole = super().batch(rng, size)
         return Parts((whole[: size // 4], whole[size // 4 :]))
 
@@ -74,7 +74,7 @@ class InParts(Line):
 class Whole(InParts):
     """Its batches in one."""
 
-    def batch(self, rng: np.random.Generator, size: int) -> Tensor:
+    def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> Tensor:
         return Line.batch(self, rng, size)
 
 

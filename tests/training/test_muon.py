@@ -83,7 +83,7 @@ def test_a_run_continues_from_its_checkpoint(tmp_path: Path) -> None:
     whole = _run(tmp_path / "whole", Line(), CFG)
 
     class Dies(Line):
-        def batch(self, rng: np.random.Generator, size: int) -> torch.Tensor:
+        def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> torch.Tensor:
             if self.seen >= 12:
                 raise KeyboardInterrupt
             return super().batch(rng, size)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,7 @@ from proprio_mllm.training.alignment import PHASES, AlignmentObjective
 from proprio_mllm.training.pipeline import Pipeline, StageError, variant_model
 from proprio_mllm.training.rollouts import RolloutRequest, read_rollouts, rollout_row
 from proprio_mllm.training.sources import Demos, shard_hash
-from proprio_mllm.training.stages import STAGES
+from proprio_mllm.training.stages import STAGES, selu
 from proprio_mllm.training.stages.alignment import start
 from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
 from proprio_mllm.training.stages.selu import CRITIC, copy_adapter, train_adapter
@@ -182,6 +183,32 @@ def test_the_same_seed_gives_the_same_weights(trained: Pipeline, shards: Path, t
         ours, theirs = load_file(tmp_path / path), load_file(Path(trained.cfg.output) / path)
         assert ours.keys() == theirs.keys()
         assert all(torch.equal(tensor, theirs[name]) for name, tensor in ours.items()), path
+
+
+def test_the_critic_judges_unless_the_simulator_is_asked_to(
+    trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judges: list[str] = []
+
+    class AskedError(Exception):
+        pass
+
+    def judge(name: str) -> Callable[..., None]:
+        def made(*args: object) -> None:
+            judges.append(name)
+            raise AskedError
+
+        return made
+
+    shutil.copytree(trained.cfg.output, tmp_path / "run")
+    for truth in ("audit", "oracle"):
+        monkeypatch.setattr(selu, "ModelJudge", judge("critic"))
+        monkeypatch.setattr(selu, "OracleJudge", judge("simulator"))
+        settings = dataclasses.replace(trained.cfg.selu, truth=truth)
+        cfg = dataclasses.replace(trained.cfg, output=str(tmp_path / "run"), selu=settings, overwrite=True)
+        with pytest.raises(AskedError):
+            Pipeline(STAGES, cfg, collect, "", correct, Lessons()).run("selu")
+    assert judges == ["critic", "simulator"]
 
 
 def test_a_stage_that_is_stopped_is_not_finished(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

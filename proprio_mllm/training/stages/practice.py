@@ -14,6 +14,7 @@ import numpy as np
 from data.shards import ShardReader, config_hash
 from proprio_mllm.model.building import load_model, save_model
 from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError
+from proprio_mllm.training.processes import first_alone
 from proprio_mllm.training.rollouts import DaggerRequest
 from proprio_mllm.training.words import WordsObjective, held_out_metrics, mixed
 
@@ -41,8 +42,6 @@ class PracticeStage:
         if pipeline.collect_dagger is None:
             raise StageError("stage 'practice' needs the simulator: run it with `python train.py stage=practice`")
         shards = pipeline.paths.shards("practice")
-        if pipeline.cfg.overwrite:
-            shutil.rmtree(shards, ignore_errors=True)
         ahead = pipeline.cfg.collect.foreseen
         decides = {"key": pipeline.key("words"), "episodes": cfg.episodes, "share": cfg.teacher_share}
         written = config_hash(decides | ({"foreseen": True} if ahead else {}))
@@ -56,14 +55,21 @@ class PracticeStage:
             written,
             ahead,
         )
-        pipeline.collect_dagger(request, workers=cfg.workers)
+        collect = pipeline.collect_dagger
+
+        def act() -> None:
+            if pipeline.cfg.overwrite:
+                shutil.rmtree(shards, ignore_errors=True)
+            collect(request, workers=cfg.workers)
+
+        first_alone(act)
         taught, own = lessons.logged(pipeline.paths.shards("lessons")), lessons.logged(shards)
         episode = mixed(lessons.episode, (cfg.own_share, own), (cfg.logged, taught))
         model = load_model(student)
         model.requires_grad_(False)
         model.core.model.language_model.requires_grad_(True)
         pipeline.loop(WordsObjective(model, episode, key, pipeline.cfg.words.reading), cfg.loop, folder / "loop")
-        save_model(model.eval(), pipeline.paths.model("practice"))
+        first_alone(lambda: save_model(model.eval(), pipeline.paths.model("practice")))
         reader = ShardReader(shards, "demos")
         notes = [json.loads(text) for text in reader.column("privileged")]
         told = zip(notes, reader.column("target"), strict=True)  # shards from before there was foresight lack `taught`

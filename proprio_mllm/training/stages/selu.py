@@ -41,8 +41,10 @@ from proprio_mllm.training.critic import (
 )
 from proprio_mllm.training.goals import Relabel
 from proprio_mllm.training.judging import judge_example
+from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.pipeline import Metrics, Pipeline
+from proprio_mllm.training.processes import first_alone
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
 from proprio_mllm.training.stages.inputs import lessons_of, turns_of
 
@@ -52,7 +54,7 @@ logger = logging.getLogger(__name__)
 ACTOR, CRITIC = "default", "critic"
 
 
-class ExampleObjective:
+class ExampleObjective(Objective):
     """Fine-tuning of one adapter on stored examples, with a share of freshly drawn ones."""
 
     def __init__(
@@ -70,20 +72,21 @@ class ExampleObjective:
         self._share = replay_share if self._examples else 1.0
         self._collator = Collator(model.processor, model.cfg)
 
-    def batch(self, rng: np.random.Generator, size: int) -> tuple[Batch, ...]:
+    def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> Parts:
         """Stored and replayed examples."""
         drawn = rng.random(size) < self._share
-        return self._collator.in_parts(
-            [self._replay(rng) if fresh else self._examples[int(rng.integers(len(self._examples)))] for fresh in drawn]
-        )
+        rows = [self._replay(rng) if fresh else self._examples[int(rng.integers(len(self._examples)))] for fresh in drawn]
+        return Parts(self._collator.in_parts(rows))
 
-    def loss(
-        self, module: nn.Module, batch: tuple[Batch, ...], generator: torch.Generator
-    ) -> tuple[Tensor, Mapping[str, float]]:
+    def weight(self, batch: Parts) -> float:
+        """Tokens of the answers."""
+        return float(batch[0].out_of)
+
+    def loss(self, module: nn.Module, batch: Batch, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
         """Cross-entropy over the answers; nothing is drawn."""
         del generator
         out = module(batch)
-        return out.loss, {"accuracy": out.correct / max(out.supervised, 1)}
+        return out.loss, {"accuracy": out.correct / max(batch.out_of, 1)}
 
 
 def copy_adapter(model: ProprioMLLM, source: str, target: str) -> None:
@@ -168,15 +171,19 @@ class _Selu:
         if finished_key(folder) == key and not self.pipeline.cfg.overwrite:
             logger.info("selu: round %d is complete", number)
             return read_json(folder / "done.json")["metrics"]
-        (folder / "done.json").unlink(missing_ok=True)
-        if self.pipeline.cfg.overwrite:  # the actor may be another one under the same key
-            shutil.rmtree(folder / "rollouts", ignore_errors=True)
         before = self.start if number == 0 else self.folder / f"round_{number - 1}" / "model"
         seed = self.pipeline.cfg.seed * 1000 + number
         request = RolloutRequest(
             before, folder / "rollouts", self.cfg.episodes, seed, self.cfg.temperature, config_hash({"key": key})
         )
-        self.collect(request)
+
+        def act() -> None:
+            (folder / "done.json").unlink(missing_ok=True)
+            if self.pipeline.cfg.overwrite:  # the actor may be another one under the same key
+                shutil.rmtree(folder / "rollouts", ignore_errors=True)
+            self.collect(request)
+
+        first_alone(act)
         self.load(before)
         if number == 0:
             self.tune(CRITIC, "selu/practice", [], self.cfg.critic, 1.0, folder / "practice")
@@ -205,8 +212,8 @@ class _Selu:
         }
         self.tune(ACTOR, "selu/actor", steps, self.cfg.actor, self.cfg.replay_share, folder / "actor")
         use_adapter(self.model, ACTOR)
-        save_model(self.model.eval(), folder / "model", self.tokenizer)
-        finish(folder, key, metrics)
+        first_alone(lambda: save_model(self.model.eval(), folder / "model", self.tokenizer))
+        first_alone(lambda: finish(folder, key, metrics))
         return metrics
 
 
@@ -237,5 +244,5 @@ class SeluStage:
         last = folder / f"round_{pipeline.cfg.selu.rounds - 1}" / "model"
         model = load_model(last, ACTOR)
         tokenizer = MotionTokenizer.load(last / "motion") if model.cfg.proprioception else None
-        save_model(model, pipeline.paths.model("selu"), tokenizer)
+        first_alone(lambda: save_model(model, pipeline.paths.model("selu"), tokenizer))
         return metrics

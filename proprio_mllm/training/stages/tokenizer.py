@@ -13,6 +13,7 @@ from data.shards import ShardReader, decode_motion
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.motion_stage import FEATURE_BIAS, MotionObjective, MotionWindows, tokenizer_metrics
 from proprio_mllm.training.pipeline import Metrics, Pipeline, loop_values, seeded
+from proprio_mllm.training.processes import first_alone
 from proprio_mllm.training.reconstruction import render
 from proprio_mllm.training.sources import Clips
 
@@ -44,6 +45,6 @@ class TokenizerStage:
         tokenizer = seeded(lambda: MotionTokenizer(motion), pipeline.cfg.seed)
         tokenizer.set_normalisation(*windows.statistics())
         pipeline.loop(MotionObjective(tokenizer, windows, key), pipeline.cfg.tokenizer, folder)
-        tokenizer.eval().save(pipeline.paths.model("tokenizer"))
-        render(tokenizer, clips, folder / "pictures")
+        first_alone(lambda: tokenizer.eval().save(pipeline.paths.model("tokenizer")))
+        first_alone(lambda: render(tokenizer, clips, folder / "pictures"))
         return tokenizer_metrics(tokenizer, windows)

@@ -1,6 +1,6 @@
 """Sessions: observations, statistics, goals, exact snapshots, determinism."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +47,14 @@ def session():
     made = Session("h1", image_size=56)
     yield made
     made.close()
+
+
+def test_success_takes_every_goal(session):
+    there, held = Predicate("on", "Mug_1", "CounterTop_1"), Predicate("held", "Mug_1")
+    for goals, status in (((there, held), (True, False)), ((there, there), (True, True)), ((), ())):
+        session.reset(replace(TASK, goals=goals), 0)
+        assert session.goal_status() == status
+        assert session.succeeded == session.finished == (bool(status) and all(status))
 
 
 def test_observation_holds_what_a_planner_may_see(session):
