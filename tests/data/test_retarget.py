@@ -151,6 +151,10 @@ def test_gates(retargeters: dict[str, Retargeter], results: dict[tuple[str, int]
     assert gate(dataclasses.replace(metrics, foot_cm=float("nan")), high, 1.03, 20.0, GateConfig()).startswith("foot_cm")
     assert gate(dataclasses.replace(metrics, self_pct=10.0), high, 1.03, 20.0, GateConfig()) == ""
     assert gate(dataclasses.replace(metrics, self_pct=12.0), high, 1.03, 20.0, GateConfig()) == "self_pct 12.00 over 10"
+    limits = dataclasses.asdict(GateConfig())
+    for name in set(limits) - {"low_pelvis", "low_pelvis_s"}:
+        worse = dataclasses.replace(metrics, **{name: limits[name] + 0.5})
+        assert gate(worse, high, 1.03, 20.0, GateConfig()).startswith(f"{name} ")
     low = high.copy()
     low[5:25] = 0.3
     assert gate(metrics, low, 1.03, 20.0, GateConfig()) == "pelvis below 0.5 of standing for 1.0 s"

@@ -12,6 +12,18 @@ def test_every_code_has_a_meaning():
     assert all(spec.meaning for spec in FAILURES.values())
 
 
+@pytest.mark.parametrize(
+    ("category", "codes"),
+    [
+        (FailureCategory.NAVIGATION, ("TooFar", "BlockedPath", "NoFreePose")),
+        (FailureCategory.BODY_ADJUSTMENT, ("BodyTooHigh", "BodyTooLow", "HeightLimit")),
+        (FailureCategory.LOGICAL, ("HandOccupied", "HandEmpty", "ReceptacleClosed", "NeedsTwoHands", "AlreadyInState")),
+    ],
+)
+def test_codes_belong_to_the_papers_types(category, codes):
+    assert {category_of(FailureCode(code), Action.parse("Pick(left, Mug_1)")) for code in codes} == {category}
+
+
 def test_margins_and_luck_are_not_public():
     pick = Action.parse("Pick(left, Mug_1)")
     outcome = ActionOutcome(pick, False, "Slipped", FailureCategory.LOGICAL, {"gap_m": 0.1}, "it slipped", "slip")

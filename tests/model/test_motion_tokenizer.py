@@ -82,6 +82,17 @@ def test_residual_codebooks_quantise_what_is_left_over():
     torch.testing.assert_close(quantizer.lookup(quantizer.tokens(vectors))[0, 0], first[one] + second[two - 7])
 
 
+def test_residual_codebooks_pull_what_is_left_over_to_their_codes():
+    quantizer = _quantizer(quantizer="rvq", stages=2)
+    quantizer(torch.randn(1, 40, 3))
+    first, second = (layer.codebook.clone() for layer in quantizer.inner.layers)
+    vectors = torch.randn(1, 6, 3)
+    result = quantizer.train()(vectors)
+    one, two = (book[index] for book, index in zip((first, second), (result.tokens[0] - torch.tensor([0, 7])).T, strict=True))
+    expected = (vectors[0] - one).square().mean() + (vectors[0] - one - two).square().mean()
+    torch.testing.assert_close(result.commitment_loss.detach(), expected)
+
+
 def test_grid_tokens_are_the_rounded_values():
     quantizer = _quantizer(quantizer="fsq", codes=60, levels=(5, 4, 3)).eval()
     vectors = torch.randn(2, 9, 3)

@@ -64,6 +64,7 @@ INVALID = ("", False, "")
         ([step(SLIPPED)], [False]),
         ([step(SLIPPED), step(GOT)], [True]),  # the other arm makes it good
         ([step(GOT), step(SLIPPED)], [False]),  # an earlier success does not
+        ([step(SLIPPED), step(("Pick(left, Cup_1)", True, "")), step(("Hold(left, Mug_1)", True, ""))], [False]),  # nor another
         ([step(SLIPPED), step(SLIPPED), step(GOT), step(MISSED)], [True, True, False]),
         ([step(SLIPPED, MISSED), step(GOT)], [True, False]),
     ],

@@ -148,6 +148,8 @@ def test_learning_rate_warms_up_and_decays() -> None:
     assert learning_rate(cfg, 10) == pytest.approx(1.0)
     assert learning_rate(cfg, 100) == pytest.approx(0.1)
     assert learning_rate(cfg, 10, seconds=60.0) == pytest.approx(0.1)
+    share = [learning_rate(cfg, 10, seconds=seconds) for seconds in (15.0, 30.0, 45.0)]
+    assert share == pytest.approx([0.1 + 0.45 * (1.0 + 0.5**0.5), 0.55, 0.1 + 0.45 * (1.0 - 0.5**0.5)])  # a cosine, no line
 
 
 def test_loss_that_is_not_finite_stops(tmp_path: Path) -> None:

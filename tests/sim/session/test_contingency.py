@@ -36,6 +36,19 @@ def test_draws_depend_on_the_key_only():
     assert forward != [other.draw(step, "Pick", name, "Mug", {}) for step, name in keys]
 
 
+def test_luck_of_two_objects_and_of_two_actions_is_not_the_same():
+    luck = Contingency(CONFIG, "medium", 7)
+    drawn = {
+        (action, name): [luck.draw(step, action, name, "Mug", {}) == "success" for step in range(200)]
+        for action in ("Pick", "Place")
+        for name in ("Mug_1", "Mug_2")
+    }
+    first = drawn["Pick", "Mug_1"]
+    for key, other in drawn.items():
+        agree = sum(a == b for a, b in zip(first, other, strict=True)) / 200
+        assert agree == 1.0 if key == ("Pick", "Mug_1") else agree < 0.8, key
+
+
 def test_a_success_at_hard_is_a_success_at_medium():
     medium, hard = Contingency(CONFIG, "medium", 1), Contingency(CONFIG, "hard", 1)
     for step in range(200):
