@@ -11,6 +11,14 @@ _ABOUT: Final = {
     "alignment": "The base model with motion tokens, motion-based position embedding, cross-spatial encoder (paper, stage 2).",
     "selu": "The aligned model after self-learning (paper, stage 3).",
 }
+#: What an ablated model does without.
+_WITHOUT: Final = {
+    "full": "",
+    "no_mpe": " Ablation: without the motion-based position embedding.",
+    "no_cse": " Ablation: without the cross-spatial encoder.",
+    "no_mpe_cse": " Ablation: without the motion-based position embedding and the cross-spatial encoder.",
+    "no_proprio": " Control: the same training without motion tokens and both.",
+}
 _PLANNERS: Final = {"practice": "words", "base": "base"}
 
 
@@ -21,9 +29,9 @@ def model_card(provenance: Mapping[str, Any]) -> str:
         provenance: as in `provenance.json`.
     """
     stage, model = provenance["stage"], provenance["config"]["model"]["name"]
-    planner = _PLANNERS.get(stage, "proprio")
-    name = planner if stage in _PLANNERS else provenance["variant"]
-    variant = f" variant={provenance['variant']}" if stage not in _PLANNERS and provenance["variant"] != "full" else ""
+    variant = "full" if stage in _PLANNERS else provenance["variant"]
+    planner = _PLANNERS.get(stage, {"full": "proprio", "no_proprio": "no_proprio"}.get(variant, f"proprio_{variant}"))
+    name = planner if stage in _PLANNERS else variant
     rows = [
         f"| {one} | {key} | {value:.4g} |"
         for one, record in provenance["stages"].items()
@@ -42,9 +50,9 @@ tags: [embodied-planning, dual-arm, humanoid, mujoco]
 
 # Proprio-MLLM {model}, {name}
 
-{_ABOUT[stage]} For the humanoids Unitree H1 and AgiBot X1 in the household simulator of this project.
+{_ABOUT[stage]}{_WITHOUT[variant]} For the humanoids Unitree H1 and AgiBot X1 in the household simulator of this project.
 
-    python eval.py planner={planner} robot=h1{variant}
+    python eval.py planner={planner} robot=h1
 
 **Trained** on what the simulator and the project's rules make, and on nothing else: no text or picture of people. Seed
 {provenance["seed"]}; shards {shards}. Stored as {provenance["stored_as"]}.

@@ -30,6 +30,10 @@ WEIGHTS = Path(__file__).parents[2] / "weights" / "tiny"
 PARTS = {
     "base": ("mrope", False, False),
     "full": ("rope_sign", True, True),
+    "no_mpe": ("mrope", True, True),
+    "no_cse": ("rope_sign", False, True),
+    "no_mpe_cse": ("mrope", False, True),
+    "no_proprio": ("mrope", False, False),
 }
 EPISODES = ["words", "practice", "base", "pointmap", "tokenizer", "alignment"]
 
@@ -81,7 +85,7 @@ def test_it_says_where_it_comes_from(name: str) -> None:
     for stage in note["stages"].values():
         assert stage["command"].startswith("python train.py stage=")
         assert stage["metrics"]["seconds"] > 0
-    assert note["variant"] == "full"
+    assert note["variant"] == ("full" if name == "base" else name)
 
 
 @pytest.mark.parametrize("name", ["words", *PARTS])
