@@ -15,7 +15,7 @@ QUICK := tests/configs tests/interface tests/model tests/planners tests/report \
   $(addprefix --ignore=tests/,$(addprefix report/test_,export.py figures.py notebook.py reconstruction.py tokenizer.py video.py) \
   $(addprefix planners/,chat/dag_plan/test_episode.py scripted/test_planner.py test_released.py))
 
-.PHONY: setup eval test test-slow quick check release-check serve motions lock pictures docs reproduce third-party clean
+.PHONY: setup eval test test-slow quick check mutants release-check serve motions lock pictures docs reproduce third-party clean
 
 setup: $(STAMP)
 
@@ -47,6 +47,10 @@ check: $(STAMP)
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 	$(BIN)/python tools/structure.py --check
+
+# Which bugs, put in one by one, the tests notice; two hours, and it goes on where it was killed.
+mutants: $(STAMP)
+	$(BIN)/python benchmarks/mutants.py
 
 # What a release needs beyond the tests: tasks come from their seeds, certificates are of the present physics.
 release-check: $(STAMP)
