@@ -116,8 +116,10 @@ def broken(node: ast.AST) -> ast.AST:
             return node.operand
         case ast.Constant(value=bool()):
             node.value = not node.value
-        case ast.Constant(value=int() | float()):
-            node.value = node.value + 1 if isinstance(node.value, int) else 1.5 * node.value + 0.5
+        case ast.Constant(value=int() as number):
+            node.value = number + 1
+        case ast.Constant(value=float() as number):
+            node.value = 1.5 * number + 0.5
     return node
 
 
