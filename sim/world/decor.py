@@ -1,4 +1,4 @@
-"""What hangs on the walls in pictures for people alone: skirting boards and windows. Planners and physics know nothing of it.
+"""What is drawn in pictures for people alone: skirting boards and windows, and round bowls. Planners and physics know nothing of it.
 
 A wall is a plane with x along it, y up and z into the room. A window goes into the middle of the widest stretch of a wall that
 no furniture covers, on the two walls that have most room for one.
@@ -52,6 +52,17 @@ def wall_decor(scene: SceneState) -> list[Board]:
         if width >= _LEAST_M and model.geom_size[wall, 1] * 2.0 > _LINTEL_M:
             boards += _window(wall, (low + high) / 2.0, width / 2.0, float(model.geom_size[wall, 1]))
     return boards
+
+
+def ring_walls(scene: SceneState) -> dict[int, float]:
+    """Boxes that are walls of a bowl or pot, by geom; the radius at the middle of the wall, metres. Their x points outwards."""
+    box = int(mujoco.mjtGeom.mjGEOM_BOX)
+    return {
+        geom: min(part.size[:2]) / 2.0 - float(scene.model.geom_size[geom, 0])
+        for parts in scene.part_of_geom.values()
+        for geom, part in parts
+        if part.shape == "cup" and int(scene.model.geom_type[geom]) == box
+    }
 
 
 def _board(

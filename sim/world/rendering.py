@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sim.scene.catalogue import load_catalogue
 from sim.scene.surfaces import FLOOR, PLASTER, SURFACES
 from sim.world.canvas import shared_canvas
-from sim.world.decor import wall_decor
+from sim.world.decor import ring_walls, wall_decor
 from sim.world.poses import ObjectPoses
 from sim.world.scene_state import SceneState
 from sim.world.servos import Servos
@@ -175,6 +175,7 @@ class Renderer:
         self._shades = greys(scene) if pretty else {}
         self._surfaces = surfaces(scene.model) if pretty else {}
         self._decor = wall_decor(scene) if pretty else []
+        self._rings = ring_walls(scene) if pretty else {}
         self._planes = np.flatnonzero(scene.model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))
         robot = np.isin(scene.model.geom_bodyid, list(scene.robot_bodies))
         labels = np.where(robot, _ROBOT, scene.object_of_geom).astype(np.int32)
@@ -221,6 +222,7 @@ class Renderer:
         scene.data.cam_xpos[index] = place
         if self._pretty:
             self._add_decor(set(outside.tolist()))
+            self._round()
             self._light()
         return pose
 
@@ -236,6 +238,25 @@ class Renderer:
             colour = np.array(one.rgba, dtype=np.float32)
             mujoco.mjv_initGeom(board, int(mujoco.mjtGeom.mjGEOM_BOX), one.size, place, data.geom_xmat[one.wall], colour)
             board.segid = -1
+
+    def _round(self) -> None:
+        """Draws bowls and pots with 24 walls in place of the 8 that are touched."""
+        for wall in self._drawn.geoms[: self._drawn.ngeom]:
+            if wall.objtype != int(mujoco.mjtObj.mjOBJ_GEOM) or wall.objid not in self._rings:
+                continue
+            radius, axis = self._rings[wall.objid], wall.mat[:, 2]
+            wall.size[1] = (radius + wall.size[0]) * np.tan(np.pi / 24.0)
+            middle = wall.pos - radius * wall.mat[:, 0]
+            for angle in (-np.pi / 12.0, np.pi / 12.0):
+                if self._drawn.ngeom == _MAX_GEOMS:
+                    return
+                out = np.cos(angle) * wall.mat[:, 0] + np.sin(angle) * wall.mat[:, 1]
+                turn = np.column_stack([out, np.cross(axis, out), axis]).astype(float)
+                piece = self._drawn.geoms[self._drawn.ngeom]
+                self._drawn.ngeom += 1
+                place = (middle + radius * out).astype(float)
+                mujoco.mjv_initGeom(piece, wall.type, wall.size.astype(float), place, turn.ravel(), wall.rgba)
+                piece.objtype, piece.objid, piece.segid, piece.matid = wall.objtype, wall.objid, wall.segid, wall.matid
 
     def _light(self) -> None:
         """A lamp over the middle of the ceiling that alone casts shadows, and little light from everywhere."""

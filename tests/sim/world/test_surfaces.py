@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from robots.spec import load_robot
+from sim.scene.objects import ObjectPlacement
 from sim.scene.rooms import room_names
-from sim.world.decor import wall_decor
+from sim.world.decor import ring_walls, wall_decor
 from sim.world.rendering import surfaces
 from sim.world.world import World
 
@@ -51,7 +52,12 @@ def test_what_hangs_on_walls_is_no_object() -> None:
     pretty = world.cameras.render("overview", 240, 320, segmentation=True, pretty=True)
     plain = world.cameras.render("overview", 240, 320, segmentation=True)
     assert pretty.segmentation is not None and plain.segmentation is not None
-    assert np.array_equal(pretty.segmentation, plain.segmentation)
+    other = pretty.segmentation != plain.segmentation  # but at the edge of what is round for people
+    rings = ring_walls(world.scene)
+    round_ones = {index for index, obj in enumerate(world.objects.values()) if set(obj.geom_ids.tolist()) & set(rings)}
+    assert set(plain.segmentation[other]) | set(pretty.segmentation[other]) <= {-1, *range(len(world.objects))}
+    assert all({a, b} & round_ones for a, b in zip(plain.segmentation[other], pretty.segmentation[other], strict=True))
+    assert other.mean() < 0.01
 
 
 @pytest.mark.parametrize("room", room_names())
@@ -72,3 +78,25 @@ def test_windows_are_where_no_furniture_is(room: str) -> None:
             mujoco.mj_ray(model, data, start, -axes[:, 2], np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8), 1, -1, hit)
             fixed = int(model.body_weldid[model.geom_bodyid[hit[0]]]) == 0
             assert hit[0] == one.wall or not fixed, model.geom(int(hit[0])).name
+
+
+def test_bowls_are_round_for_people_and_have_eight_walls_otherwise() -> None:
+    world = World(None, "kitchen_1", [ObjectPlacement("Bowl_1", "DiningTable_1"), ObjectPlacement("Mug_1", "DiningTable_1")])
+    rings = ring_walls(world.scene)
+    bowl = world.objects["Bowl_1"]
+    assert set(rings) <= set(bowl.geom_ids.tolist()) and len(rings) == 8
+    assert list(rings.values()) == pytest.approx([min(bowl.type.size[:2]) / 2.0 - 0.005] * 8, abs=1e-3)
+    middle, near = world.poses.center("Bowl_1"), np.eye(4)
+    near[:3, :3] = np.diag([1.0, -1.0, -1.0])  # straight down
+    near[:3, 3] = middle + (0.0, 0.0, 0.4)
+    outlines = []
+    for pretty in (False, True):
+        picture = world.cameras.render_from(near, 40.0, 200, 200, pretty=pretty).astype(int)
+        yellow = (picture[..., 1] > 0.82 * picture[..., 0]) & (picture[..., 2] < 0.5 * picture[..., 0])
+        rows, columns = np.nonzero(yellow)
+        around = np.arctan2(rows - 100, columns - 100)
+        reach = np.hypot(rows - 100, columns - 100)
+        sectors = ((around + np.pi) / (2.0 * np.pi) * 36).astype(int) % 36
+        edge = np.array([reach[sectors == sector].max() for sector in range(36)])
+        outlines.append(edge.std() / edge.mean())
+    assert outlines[1] < 0.6 * outlines[0]
