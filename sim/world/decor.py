@@ -1,4 +1,4 @@
-"""What is drawn in pictures for people alone: skirting boards and windows, and round bowls. Planners and physics know nothing of it.
+"""What is drawn for people alone: skirting boards, windows and round bowls. Planners and physics know nothing of it.
 
 A wall is a plane with x along it, y up and z into the room. A window goes into the middle of the widest stretch of a wall that
 no furniture covers, on the two walls that have most room for one.
