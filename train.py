@@ -93,11 +93,12 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
     )
     wanted = tuple(STAGES) if cfg.stage == "all" else (cfg.stage,)
     metrics = {name: pipeline.run(name) for name in wanted}
-    if cfg.release is not None:
+    release = cfg.release
+    if release is not None:
         from proprio_mllm.training.release import export
 
         try:
-            first_alone(lambda: export(pipeline, cfg.release or ""))
+            first_alone(lambda: export(pipeline, release))
         except ValueError as error:
             raise StageError(str(error)) from error
     return metrics

@@ -1,6 +1,6 @@
 """The state of a world as values: what objects there are, what can be done with them, and what state each is in.
 
-The simulator takes them from physics (`sim.skills.facts`), the text world keeps them (`sim.collection.text_facts`), and what a
+The simulator takes them from physics (`sim.world.facts`), the text world keeps them (`sim.collection.text_facts`), and what a
 planner believes is a part of them (`interface.belief`). Preconditions of actions, goals and the job planner read nothing else,
 so what counts as open, filled or too heavy is decided here, for all of them.
 """
@@ -13,8 +13,9 @@ from typing import Final, Protocol
 
 from interface.bodies import Arm
 
-#: Shares of a door's travel: from which on it counts as open, beyond which Open, and below which Close, has nothing left to do.
-_OPEN, _OPENED, _CLOSED = 1.0 / 3.0, 0.6, 0.06
+#: Shares of a door's travel: beyond which it counts as open, beyond which Open, and below which Close, has nothing left to do.
+OPEN_SHARE: Final = 1.0 / 3.0
+_OPENED, _CLOSED = 0.6, 0.06
 #: Shares of a vessel's volume from which on it counts as filled, and as full.
 FILLED_SHARE: Final = 0.1
 FULL_SHARE: Final = 0.999
@@ -125,7 +126,7 @@ class ObjectFacts:
     @property
     def open(self) -> bool:
         """Whether it is open, as goals mean it."""
-        return self.can.openable and self.openness > _OPEN
+        return self.can.openable and self.openness > OPEN_SHARE
 
     @property
     def opened(self) -> bool:
@@ -215,10 +216,6 @@ class Facts:
     def overload_kg(self, object_id: str, arms: int) -> float:
         """By how much an object's weight exceeds what one or two arms carry; negative when they do carry it."""
         return self.objects[object_id].mass_kg - self.loads_kg[arms - 1]
-
-    def free_arms(self) -> tuple[Arm, ...]:
-        """Empty hands, the right one first."""
-        return () if self.lifted is not None else tuple(arm for arm in (Arm.RIGHT, Arm.LEFT) if self.held[arm] is None)
 
     def arm_with(self, object_id: str) -> Arm | None:
         """The arm that holds an object by itself."""

@@ -14,6 +14,7 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -195,7 +196,7 @@ def run_loop(
             norm = nn.utils.clip_grad_norm_(trained, cfg.clip)
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
-            same_everywhere(list(module.buffers()))  # codes that are learnt without gradients
+            same_everywhere(module.buffers())  # codes that are learnt without gradients
             for name, value in {**found, "grad_norm": float(norm)}.items():
                 sums[name] = sums.get(name, 0.0) + value
                 sums[f"#{name}"] = sums.get(f"#{name}", 0.0) + 1.0
@@ -213,7 +214,7 @@ def run_loop(
                 sums = {}
             if done % cfg.checkpoint_every == 0 or final:
                 taken = spent + time.monotonic() - began
-                first_alone(lambda: save_checkpoint(checkpoint, done, module, optimizer, objective.key, taken))  # noqa: B023
+                first_alone(partial(save_checkpoint, checkpoint, done, module, optimizer, objective.key, taken))
             if final:
                 break
     module.eval()

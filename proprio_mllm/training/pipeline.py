@@ -15,6 +15,9 @@ from typing import Any, Protocol, get_args
 
 from configs.schema.model import ModelConfig
 from configs.schema.train import LoopConfig, TrainConfig, Variant
+from proprio_mllm.model.building import save_model
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.loop import Objective, run_loop
 from proprio_mllm.training.metrics import MetricWriter
@@ -217,6 +220,10 @@ class Pipeline:
         if given:
             logger.info("%s: %s has pretrained weights, nothing to do", stage, self.cfg.model.name)
         return given
+
+    def store(self, name: str, model: ProprioMLLM, tokenizer: MotionTokenizer | None = None) -> None:
+        """Writes a stage's model, and the motion tokenizer that its prompts were made with."""
+        first_alone(lambda: save_model(model.eval(), self.paths.model(name), tokenizer))
 
     def loop(self, objective: Objective, cfg: LoopConfig, folder: Path) -> None:
         """Runs one objective with this configuration's seed and logger."""

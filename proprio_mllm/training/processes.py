@@ -8,7 +8,7 @@ gradient has none in any process. With one process nothing of this does anything
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import timedelta
 from functools import cache
 from typing import TypeVar
@@ -73,7 +73,7 @@ def add_gradients(parameters: Sequence[nn.Parameter]) -> None:
             one.grad = piece.view_as(one).clone() if one.grad is None else one.grad.copy_(piece.view_as(one))
 
 
-def same_everywhere(tensors: Sequence[Tensor]) -> None:
+def same_everywhere(tensors: Iterable[Tensor]) -> None:
     """Gives all processes the first one's values."""
     if processes().num_processes > 1:
         with torch.no_grad():

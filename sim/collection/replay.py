@@ -23,11 +23,10 @@ from interface.motion import Motion
 from robots.spec import load_robot
 from sim.collection.view_sampling import camera_in_pelvis
 from sim.scene.compiler import BASE_JOINTS
-from sim.scene.objects import ObjectPlacement
 from sim.scene.rooms import load_room
 from sim.skills.obstacles import navigation_map
 from sim.tasks.sample import UNSEEN_TYPES
-from sim.world.world import World
+from sim.world.world import World, own_placements
 
 Array = NDArray[np.float64]
 _PATH_STRIDE = 4
@@ -36,8 +35,8 @@ _PATH_STRIDE = 4
 @lru_cache(maxsize=6)
 def _world(robot: str, room: str) -> World:
     """A room with its own things, but none of a type that training does not show."""
-    seen = [item for item in load_room(room).objects if item.id.rsplit("_", 1)[0] not in UNSEEN_TYPES]
-    return World(load_robot(robot), room, [ObjectPlacement(item.id, item.receptacle, yaw_deg=item.yaw_deg) for item in seen])
+    seen = [one for one in own_placements(load_room(room)) if one.object_id.rsplit("_", 1)[0] not in UNSEEN_TYPES]
+    return World(load_robot(robot), room, seen)
 
 
 def picture_frames(frames: int, fps: float, pictures_per_s: float) -> NDArray[np.int64]:

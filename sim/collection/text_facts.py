@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from interface.effects import Condition
-from interface.facts import Call, Facts, ObjectFacts, Objects
+from interface.facts import OPEN_SHARE, Call, Facts, ObjectFacts, Objects
 from interface.symbolic import SymbolicState
 from robots.spec import RobotSpec
 from sim.scene.catalogue import load_catalogue
@@ -51,7 +51,7 @@ class TextFacts:
         self._types = {name: catalogue.get(name.rsplit("_", 1)[0]) for name in names}
         self._can = {name: kind.affordances(name in draft.objects) for name, kind in self._types.items()}
         for name, kind in self._types.items():
-            self.state.conditions[Condition.OPEN][name] = kind.openable and kind.starts_open > 1.0 / 3.0
+            self.state.conditions[Condition.OPEN][name] = kind.openable and kind.starts_open > OPEN_SHARE
             for key, value in starts.get(name, {}).items():
                 if key in _STARTS:
                     self.state.conditions[_STARTS[key]][name] = bool(value)
@@ -96,7 +96,7 @@ class TextFacts:
 
     def hidden(self, name: str) -> bool:
         """Whether an object is shut away."""
-        return any(self._can[carrier].encloses and not self._is(Condition.OPEN, carrier) for carrier in self.carriers(name))
+        return any(self.object(carrier).shut for carrier in self.carriers(name))
 
     def succeed(self, call: Call, in_front: str) -> None:
         """Carries an action out.
@@ -112,7 +112,7 @@ class TextFacts:
                 self.state.at[name] = in_front
         for name in self.objs:
             place = self.state.at.get(name)
-            if place is not None and self._heats(place):
+            if place is not None and self._can[place].heat_source and (item := self.object(place)).on and not item.open:
                 self._heated[name] = self._heated.get(name, 0) + 1
 
     def _is(self, condition: Condition, name: str) -> bool:
@@ -122,8 +122,3 @@ class TextFacts:
         """What switches it: itself, the knob of a burner, the tap of a basin."""
         switch = name if self._can[name].toggleable else self._scene.heaters.get(name, self._taps.get(name))
         return switch if switch in self._types else None
-
-    def _heats(self, place: str) -> bool:
-        can, switch = self._can[place], self._switch(place)
-        on = switch is not None and self._is(Condition.ON, switch)
-        return can.heat_source and on and not (can.openable and self._is(Condition.OPEN, place))

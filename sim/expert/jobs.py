@@ -77,7 +77,7 @@ class Setting:
 
     def free_arms(self) -> tuple[Arm, ...]:
         """Usable arms with an empty hand, the preferred one first."""
-        return tuple(arm for arm in self.arms if arm in self.facts.free_arms())
+        return () if self.facts.lifted is not None else tuple(arm for arm in self.arms if self.facts.held[arm] is None)
 
     def in_place(self, object_id: str) -> bool:
         """Whether a held object still rests where it was, as Hold leaves it, or is furniture."""
@@ -205,7 +205,7 @@ def _put_down_lifted(leaves: Sequence[Predicate], at: Setting) -> Job:
             return Job("PlaceBoth", leaf.receptacle_id)
     home = at.homes.get(at.facts.lifted or "")
     open_places = (name for name, item in at.objects.items() if item.can.receptacle and not item.can.movable
-                   and not at.objects[name].shut)  # fmt: skip
+                   and not item.shut)  # fmt: skip
     return Job("PlaceBoth", home if home is not None else next(open_places))
 
 

@@ -29,7 +29,9 @@ def temperature_name(celsius: float) -> str:
     return "Hot" if celsius > 45.0 else "RoomTemp"
 
 
-def object_metadata(world: World, obj: ObjectInstance, parents: tuple[str, ...], contents: tuple[str, ...]) -> dict[str, Any]:
+def object_metadata(
+    world: World, obj: ObjectInstance, parents: tuple[str, ...], contents: tuple[str, ...], mass_kg: float
+) -> dict[str, Any]:
     """One object's record."""
     kind, state = obj.type, obj.state
     low, high = box_in_world(world.data, obj)
@@ -74,7 +76,7 @@ def object_metadata(world: World, obj: ObjectInstance, parents: tuple[str, ...],
         "isColdSource": kind.has("cold_source"),
         "temperature": temperature_name(state.temperature),
         "temperatureCelsius": state.temperature,
-        "mass": sum(world.objects[name].laden_mass_kg for name in (obj.object_id, *contents)) if obj.movable else 0.0,
+        "mass": mass_kg if obj.movable else 0.0,
         "salientMaterials": list(kind.materials),
         "parentReceptacles": list(parents),
         "receptacleObjectIds": list(contents),
@@ -87,12 +89,14 @@ def object_metadata(world: World, obj: ObjectInstance, parents: tuple[str, ...],
 def world_metadata(world: World) -> dict[str, Any]:
     """The whole scene's record: `objects`, `agent`, `sceneName`, `sceneBounds`, `inventoryObjects`."""
     parents = world.containment.all_parents()
+    masses = world.containment.masses_kg(parents)
     contents: dict[str, list[str]] = {}
     for name, above in parents.items():
         for parent in above:
             contents.setdefault(parent, []).append(name)
     objects = [
-        object_metadata(world, obj, parents.get(name, ()), tuple(contents.get(name, ()))) for name, obj in world.objects.items()
+        object_metadata(world, obj, parents.get(name, ()), tuple(contents.get(name, ())), masses[name])
+        for name, obj in world.objects.items()
     ]
     x0, y0, x1, y1 = world.room.bounds
     record: dict[str, Any] = {

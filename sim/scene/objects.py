@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from interface.facts import Affordances
+from interface.facts import OPEN_SHARE, Affordances
 from sim.scene.catalogue import Catalogue, MovingSpec, ObjectType, SurfaceSpec
 
 ROOM_TEMPERATURE_C: Final = 20.0
@@ -163,7 +163,7 @@ class ObjectInstance:
     @property
     def is_open(self) -> bool:
         """Whether its door, drawer or lid is more than a third open; True for what cannot be closed."""
-        return self.openness > 1.0 / 3.0 if self.moving else True
+        return self.openness > OPEN_SHARE if self.moving else True
 
     @property
     def is_shut(self) -> bool:

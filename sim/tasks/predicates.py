@@ -1,8 +1,7 @@
-"""Goal predicates over object states: what a task asks for, and how much of it holds.
+"""Goal predicates over object states: what a task asks for.
 
 A goal is a small tree in plain JSON (`Predicate`). It is evaluated on the facts of a world alone, so it never depends on how it
-was reached. Paper: tasks and success of the DualTHOR benchmark;
-goal-condition success follows the usual definition (satisfied conditions over all conditions).
+was reached. Paper: tasks and success of the DualTHOR benchmark.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,10 +64,23 @@ class Containment:
             height_m=height_m, near=near, rng=rng, gap_m=gap_m, ignore=ignore, band_m=band_m, through_doors=through_doors,
         )  # fmt: skip
 
+    def masses_kg(self, parents: Mapping[str, tuple[str, ...]]) -> dict[str, float]:
+        """Masses of all objects with liquid and contents.
+
+        Args:
+            parents: of `all_parents`.
+        """
+        own = {name: obj.laden_mass_kg for name, obj in self._scene.objects.items()}
+        masses = dict(own)
+        for name, carriers in parents.items():
+            for carrier in carriers:
+                masses[carrier] += own[name]
+        return masses
+
     def total_mass_kg(self, object_id: str) -> float:
         """Mass with liquid and contents."""
-        inside = self.contents(object_id)
-        return sum(self._scene.object(name).laden_mass_kg for name in (object_id, *inside))
+        self._scene.object(object_id)
+        return self.masses_kg(self.all_parents())[object_id]
 
     def needs_two_hands(self, object_id: str) -> bool:
         """Whether its type or its present weight asks for both hands."""

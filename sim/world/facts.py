@@ -11,10 +11,7 @@ def world_facts(world: World) -> Facts:
     """What is the case now."""
     objects, robot = world.objects, world.robot
     parents = world.containment.all_parents()
-    mass_kg = {name: obj.laden_mass_kg for name, obj in objects.items()}
-    for name, carriers in parents.items():
-        for carrier in carriers:
-            mass_kg[carrier] += objects[name].laden_mass_kg
+    mass_kg = world.containment.masses_kg(parents)
     loads_kg = (float("inf"), float("inf")) if robot is None else (robot.max_load_kg(1), robot.max_load_kg(2))
     puddles = {puddle.surface for puddle in world.liquids.puddles}
     switches = {target: switch for switch, target in reversed([*world.room.links.items()])}

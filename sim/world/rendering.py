@@ -230,14 +230,23 @@ class Renderer:
         """What hangs on the walls that are seen."""
         data = self._scene.data
         for one in self._decor:
-            if one.wall in outside or self._drawn.ngeom == _MAX_GEOMS:
+            if one.wall in outside:
                 continue
-            place = data.geom_xpos[one.wall] + data.geom_xmat[one.wall].reshape(3, 3) @ one.centre
-            board = self._drawn.geoms[self._drawn.ngeom]
-            self._drawn.ngeom += 1
-            colour = np.array(one.rgba, dtype=np.float32)
-            mujoco.mjv_initGeom(board, int(mujoco.mjtGeom.mjGEOM_BOX), one.size, place, data.geom_xmat[one.wall], colour)
-            board.segid = -1
+            turn = data.geom_xmat[one.wall].reshape(3, 3)
+            board = self._add_box(one.size, data.geom_xpos[one.wall] + turn @ one.centre, turn, np.array(one.rgba))
+            if board is not None:
+                board.segid = -1
+
+    def _add_box(
+        self, half: NDArray[np.float64], place: NDArray[np.float64], turn: NDArray[np.float64], rgba: NDArray[np.float64]
+    ) -> mujoco.MjvGeom | None:
+        """One more box in the picture, None when it is full."""
+        if self._drawn.ngeom == _MAX_GEOMS:
+            return None
+        box = self._drawn.geoms[self._drawn.ngeom]
+        self._drawn.ngeom += 1
+        mujoco.mjv_initGeom(box, int(mujoco.mjtGeom.mjGEOM_BOX), half, place, turn.ravel(), rgba.astype(np.float32))
+        return box
 
     def _round(self) -> None:
         """Draws bowls and pots with 24 walls in place of the 8 that are touched."""
@@ -248,15 +257,11 @@ class Renderer:
             wall.size[1] = (radius + wall.size[0]) * np.tan(np.pi / 24.0)
             middle = wall.pos - radius * wall.mat[:, 0]
             for angle in (-np.pi / 12.0, np.pi / 12.0):
-                if self._drawn.ngeom == _MAX_GEOMS:
-                    return
                 out = np.cos(angle) * wall.mat[:, 0] + np.sin(angle) * wall.mat[:, 1]
                 turn = np.column_stack([out, np.cross(axis, out), axis]).astype(float)
-                piece = self._drawn.geoms[self._drawn.ngeom]
-                self._drawn.ngeom += 1
-                place = (middle + radius * out).astype(float)
-                mujoco.mjv_initGeom(piece, wall.type, wall.size.astype(float), place, turn.ravel(), wall.rgba)
-                piece.objtype, piece.objid, piece.segid, piece.matid = wall.objtype, wall.objid, wall.segid, wall.matid
+                piece = self._add_box(wall.size.astype(float), (middle + radius * out).astype(float), turn, wall.rgba)
+                if piece is not None:
+                    piece.objtype, piece.objid, piece.segid, piece.matid = wall.objtype, wall.objid, wall.segid, wall.matid
 
     def _light(self) -> None:
         """A lamp over the middle of the ceiling that alone casts shadows, and little light from everywhere."""

@@ -52,6 +52,11 @@ _HAND_GAP_M: Final = 0.09
 _PARKED_M: Final = 15.0
 
 
+def own_placements(room: Room) -> list[ObjectPlacement]:
+    """A room's own objects, where they stand when nothing else is said."""
+    return [ObjectPlacement(item.id, item.receptacle, yaw_deg=item.yaw_deg) for item in room.objects]
+
+
 class World:
     """One robot in one furnished room.
 
@@ -105,7 +110,7 @@ class World:
         self.catalogue = load_catalogue()
         self.rng = np.random.default_rng(seed)
         if placements is None:
-            placements = [ObjectPlacement(item.id, item.receptacle, yaw_deg=item.yaw_deg) for item in self.room.objects]
+            placements = own_placements(self.room)
         ids = [placement.object_id for placement in placements]
         fixed = [item.id for item in self.room.furniture]
         repeated = sorted({name for name in ids if ids.count(name) > 1} | (set(ids) & set(fixed)))

@@ -271,6 +271,11 @@ def trained(tmp_path_factory: pytest.TempPathFactory, shards: Path) -> Pipeline:
     cfg = debug_config(root)
     (root / "tiny").mkdir()
     shutil.copytree(shards, root / "tiny" / "data")
+    return all_stages(cfg)
+
+
+def all_stages(cfg: TrainConfig) -> Pipeline:
+    """Runs them."""
     pipeline = Pipeline(STAGES, cfg, collect, "python train.py stage=all", correct, Lessons())
     for stage in STAGES:
         assert pipeline.run(stage) is not None

@@ -15,7 +15,6 @@ from proprio_mllm.model.building import (
     build_point_map,
     build_processor,
     load_model,
-    save_model,
     start_motion_rows,
 )
 from proprio_mllm.model.groups import train_only
@@ -25,7 +24,6 @@ from proprio_mllm.model.tensors import read_tensors
 from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, body_state_accuracy
 from proprio_mllm.training.base import grounding_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded, variant_model
-from proprio_mllm.training.processes import first_alone
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
 from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
 from proprio_mllm.training.turns import turn_accuracy
@@ -63,7 +61,7 @@ class AlignmentStage:
             pipeline.loop(
                 AlignmentObjective(model, data, phase, pipeline.cfg.alignment, f"{key}/{phase}"), loop, folder / phase
             )
-        first_alone(lambda: save_model(model.eval(), pipeline.paths.model("alignment"), read))
+        pipeline.store("alignment", model, read)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
         felt = {} if turns.codes is None else body_state_accuracy(model, demos, turns.codes)
         told = held_out_metrics(model, {"": pipeline.lessons.episode})

@@ -7,14 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from proprio_mllm.model.building import build_model, build_processor, load_model, save_model
+from proprio_mllm.model.building import build_model, build_processor, load_model
 from proprio_mllm.model.dense import DenseHead
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.word_tokens import add_word_tokens
 from proprio_mllm.model.wording import id_words
 from proprio_mllm.training.base import DenseObjective, JointObjective, grounding_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config, seeded
-from proprio_mllm.training.processes import first_alone
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
 from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
 from proprio_mllm.training.text import adopt, corpus, start_from_words, whole_words
@@ -60,6 +59,6 @@ class BaseStage:
         turns, words = turns_of(pipeline, model, demos), episodes_in_words(pipeline, model, f"{key}/words")
         joint = JointObjective(model, head, views, turns, demos, clips, words, cfg.base, f"{key}/joint")
         pipeline.loop(joint, cfg.base.joint, folder / "joint")
-        first_alone(lambda: save_model(model.eval(), pipeline.paths.model("base")))
+        pipeline.store("base", model)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE))
         return {**asked, **turn_accuracy(model, turns), **held_out_metrics(model, {"": lessons.episode})}

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from data.shards import ShardReader, config_hash
-from proprio_mllm.model.building import load_model, save_model
+from proprio_mllm.model.building import load_model
 from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError
 from proprio_mllm.training.processes import first_alone
 from proprio_mllm.training.rollouts import DaggerRequest
@@ -69,7 +69,7 @@ class PracticeStage:
         model.requires_grad_(False)
         model.core.model.language_model.requires_grad_(True)
         pipeline.loop(WordsObjective(model, episode, key, pipeline.cfg.words.reading), cfg.loop, folder / "loop")
-        first_alone(lambda: save_model(model.eval(), pipeline.paths.model("practice")))
+        pipeline.store("practice", model)
         reader = ShardReader(shards, "demos")
         notes = [json.loads(text) for text in reader.column("privileged")]
         told = zip(notes, reader.column("target"), strict=True)  # shards from before there was foresight lack `taught`

@@ -244,5 +244,5 @@ class SeluStage:
         last = folder / f"round_{pipeline.cfg.selu.rounds - 1}" / "model"
         model = load_model(last, ACTOR)
         tokenizer = MotionTokenizer.load(last / "motion") if model.cfg.proprioception else None
-        first_alone(lambda: save_model(model, pipeline.paths.model("selu"), tokenizer))
+        pipeline.store("selu", model, tokenizer)
         return metrics

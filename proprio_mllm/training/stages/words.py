@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from configs.schema.model import ModelConfig
-from proprio_mllm.model.building import build_model, build_processor, save_model
+from proprio_mllm.model.building import build_model, build_processor
 from proprio_mllm.model.word_tokens import add_word_tokens
 from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config
-from proprio_mllm.training.processes import first_alone
 from proprio_mllm.training.words import WordsObjective, held_out_metrics, mixed
 
 
@@ -46,7 +45,7 @@ class WordsStage:
         episode = mixed(lessons.episode, (share, logged))
         objective = WordsObjective(model, episode, key, pipeline.cfg.words.reading)
         pipeline.loop(objective, pipeline.cfg.words.loop, folder / "loop")
-        first_alone(lambda: save_model(model.eval(), pipeline.paths.model("words")))
+        pipeline.store("words", model)
         return held_out_metrics(model, {"": lessons.episode, "_logged": logged})
 
 

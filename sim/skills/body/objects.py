@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.scene.objects import ObjectInstance
+from sim.world.facts import world_facts
 from sim.world.world import World
 
 Array = NDArray[np.float64]
@@ -34,13 +35,11 @@ class ObjectGeometry:
 
     def faces_rad(self, object_id: str) -> tuple[float, ...]:
         """Preferred approach directions (world yaw) of an object: square to its support, or to its own sides."""
-        obj = self._world.objects[object_id]
-        square = obj
-        if obj.movable and not self._world.containment.needs_two_hands(object_id):
-            carriers = self._world.containment.parents(object_id)
-            if not carriers:
+        item, square = world_facts(self._world).objects[object_id], self._world.objects[object_id]
+        if item.can.movable and not item.two_handed:
+            if not item.carriers:
                 return ()
-            square = self._world.objects[carriers[-1]]
+            square = self._world.objects[item.carriers[-1]]
         # a tap may stand beside its basin, which is used from the basin's front
         front = self._world.poses.front(self._world.room.links.get(square.object_id, square.object_id))
         angle = float(np.arctan2(front[1], front[0]))
