@@ -111,8 +111,8 @@ class TextFacts:
             if name in self.objs and name not in self.state.at:
                 self.state.at[name] = in_front
         for name in self.objs:
-            place = self.state.at.get(name)
-            if place is not None and self._can[place].heat_source and (item := self.object(place)).on and not item.open:
+            below = (self.object(carrier) for carrier in self.carriers(name) if self._can[carrier].heat_source)
+            if any(item.on and not item.open for item in below):
                 self._heated[name] = self._heated.get(name, 0) + 1
 
     def _is(self, condition: Condition, name: str) -> bool:

@@ -69,7 +69,7 @@ def find_free_spot(
     gap_m: float = 0.03,
     ignore: Iterable[str] = (),
     band_m: float = REACH_BAND_M,
-    through_doors: bool = False,
+    through_doors: bool,
 ) -> NDArray[np.float64] | None:
     """A point on a receptacle's surfaces where an object of that footprint can be put.
 

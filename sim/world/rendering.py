@@ -34,6 +34,8 @@ _MAX_GEOMS: Final = 1500
 _SAMPLES: Final = 8
 _HEADLIGHT, _FILL = 0.75, 0.5
 _LAMP, _LAMP_ABOVE_M = 0.5, 1.0
+#: Half the thickness below which walls cast no shadow: their own would speck them.
+_THIN_M: Final = 0.01
 #: Greys of black robots: brighter ones are left alone; parts with a larger radius are shells.
 _BLACK, _SHELL, _JOINT, _SHELL_M = 0.25, 0.68, 0.3, 0.14
 #: A camera of the room that stands in for one that is put somewhere for a picture.
@@ -269,9 +271,10 @@ class Renderer:
         for geom in self._drawn.geoms[: self._drawn.ngeom]:
             if geom.objtype != int(mujoco.mjtObj.mjOBJ_GEOM):
                 continue
-            if geom.objid == ceiling.id:
+            thin = geom.type == int(mujoco.mjtGeom.mjGEOM_BOX) and geom.size.min() < _THIN_M
+            if thin or geom.objid == ceiling.id:
                 geom.category = int(mujoco.mjtCatBit.mjCAT_DECOR)  # so it casts no shadow
-            elif geom.objid in self._shades:
+            if geom.objid in self._shades:
                 geom.rgba[:3] = self._shades[geom.objid]
         for light in self._drawn.lights[: self._drawn.nlight]:
             light.castshadow = 0

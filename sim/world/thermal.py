@@ -1,4 +1,4 @@
-"""Heat and cold: temperatures approach those of what objects lie in or on, and food cooks.
+"""Heat and cold: temperatures approach those of what objects lie in or on, and food cooks. An open door lets both out.
 
 A temperature approaches that of its surroundings exponentially; what is cooked stays so. Paper: state changes of DualTHOR.
 """
@@ -17,7 +17,7 @@ from sim.world.states import ObjectStates
 _HOT_C: Final = 95.0
 _COLD_C: Final = 4.0
 _COOKED_C: Final = 65.0
-#: Time constants, seconds: on or in a heat source, in a closed cold one, in the room.
+#: Time constants, seconds: on a heat source or in a closed one, in a closed cold one, in the room.
 _HEATING_S: Final = 8.0
 _COOLING_S: Final = 20.0
 _ROOM_S: Final = 90.0
@@ -54,7 +54,7 @@ class Thermal:
             item = objects[name]
             target_c, time_constant_s = ROOM_TEMPERATURE_C, _ROOM_S
             for parent in (objects[p] for p in above):
-                if parent.type.has("heat_source") and parent.state.isToggled:
+                if parent.type.has("heat_source") and parent.state.isToggled and not (parent.moving and parent.is_open):
                     target_c, time_constant_s = _HOT_C, _HEATING_S
                 elif parent.type.has("cold_source") and not parent.is_open:
                     target_c, time_constant_s = _COLD_C, _COOLING_S

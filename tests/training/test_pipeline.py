@@ -135,6 +135,8 @@ def test_rows_of_motion_tokens_may_start_from_the_codes(trained: Pipeline) -> No
         kept[ids] = False
         first, second = (model.core.get_input_embeddings()(kept.nonzero()[:, 0]) for model in (coded, drawn))
     torch.testing.assert_close(first, second)
+    torch.testing.assert_close(rows.std(), first.std(), rtol=0.5, atol=0.0)  # as large as other rows, codes are not
+    assert float(codes.std() / rows.std()) > 2.0
     far = torch.pdist(codes)
     assert float(torch.corrcoef(torch.stack([far, torch.pdist(rows)]))[0, 1]) > 0.7
     assert float(torch.corrcoef(torch.stack([far, torch.pdist(others)]))[0, 1]) < 0.3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -10,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -18,6 +20,7 @@ from proprio_mllm.training.loop import run_loop
 from proprio_mllm.training.paths import StagePaths
 from tests.training import together
 from tests.training.conftest import debug_config
+from tests.training.together import Mixed
 
 ROOT = Path(__file__).parents[2]
 
@@ -75,9 +78,22 @@ def test_a_killed_process_ends_the_run_and_fewer_finish_it(alone: Path, tmp_path
     alike(alone / "weights_0.safetensors", tmp_path / "weights_0.safetensors")
 
 
+def test_micro_batches_weigh_what_they_teach(tmp_path: Path) -> None:
+    first, second = Mixed(), Mixed()
+    second.module.load_state_dict(first.module.state_dict())
+    result = run_loop(first, dataclasses.replace(together.CFG, steps=1), tmp_path, 0, None, micro_batches=4)
+    streams = [np.random.default_rng([0, 0, number]) for number in range(4)]
+    kind = second.kind(streams[0])
+    batches = [second.batch(stream, 4, kind) for stream in streams]
+    weights = [second.weight(batch) for batch in batches]
+    assert len(set(weights)) > 1
+    losses = [sum(second.loss(second.module, part, torch.Generator())[0].item() for part in batch) for batch in batches]
+    assert result.last["loss"] == pytest.approx(np.average(losses, weights=weights))
+
+
 def test_micro_batches_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="batch of 16 in micro_batches=3 cannot be shared by 1 processes"):
-        run_loop(together.Mixed(), together.CFG, tmp_path, 0, None, micro_batches=3)
+        run_loop(Mixed(), together.CFG, tmp_path, 0, None, micro_batches=3)
 
 
 @pytest.mark.slow

@@ -22,12 +22,12 @@ CFG = LoopConfig(steps=24, batch=16, lr=1e-2, warmup=3, checkpoint_every=6, log_
 
 
 class Senses(nn.Module):
-    """Reads, and sees in some steps alone; hears never."""
+    """Reads, and sees in some steps alone; what it tastes is in some batches of a step, and it hears never."""
 
     def __init__(self) -> None:
         super().__init__()
         torch.manual_seed(processes().process_index)  # only the first one's weights are to count
-        self.reads, self.sees, self.hears = nn.Linear(4, 8), nn.Linear(4, 8), nn.Linear(4, 8)
+        self.reads, self.sees, self.tastes, self.hears = (nn.Linear(4, 8) for _ in range(4))
         self.tells = nn.Linear(8, 1)
 
 
@@ -58,7 +58,8 @@ class Mixed(Objective):
         self.steps += 1
         if self.steps == self.dies_at:
             os.kill(os.getpid(), signal.SIGKILL)
-        told = module.tells(torch.tanh(getattr(module, kind)(rows)))[:, 0]
+        senses = [kind, "tastes"] if float(rows[0, 0]) > 0.8 else [kind]
+        told = sum(module.tells(torch.tanh(getattr(module, sense)(rows)))[:, 0] for sense in senses)
         return ((told - rows.sum(1)).square() * taught).sum() / whole, {"rows": float(len(rows))}
 
 

@@ -13,7 +13,9 @@ from interface.steps import Action, PlanStep
 from proprio_mllm.evaluation.lessons import WordsOnly
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 from robots.spec import load_robot
+from sim.collection.text_facts import TextFacts
 from sim.collection.text_world import TextWorld
+from sim.tasks.drafts import Draft
 from sim.tasks.families import FAMILIES, draw
 from sim.tasks.sample import scene_of
 
@@ -69,6 +71,17 @@ def test_every_family_action_and_code_occurs(episodes: list[Played]) -> None:
         assert code == "ok" or code in Action.parse(text).spec.codes, text
     wanted = {"ok", "TooFar", "BodyTooHigh", "BodyTooLow", "HandEmpty", "HandOccupied", "AlreadyHeld", "AlreadyInState"}
     assert wanted | {"ObjectNotKnown", "BothHandsBusy", "GraspMissed"} <= {code for _, _, code in outcomes}
+
+
+def test_food_cooks_in_a_pot_and_behind_a_door_that_is_shut() -> None:
+    scene = scene_of("kitchen_1")
+    places = {"Pot_1": "StoveBurner_1", "Potato_1": "Pot_1", "Egg_1": "Microwave_1"}
+    for opened in (True, False):
+        states = {"Microwave_1": {"isOpen": opened, "isToggled": True}, "StoveKnob_1": {"isToggled": True}}
+        facts = TextFacts(Draft("cook", "kitchen_1", places, states=states), scene, load_robot("h1"))
+        for _ in range(5):
+            facts.succeed(Action.parse("GoTo(DiningTable_1)"), "DiningTable_1")
+        assert facts.object("Potato_1").cooked and facts.object("Egg_1").cooked is not opened
 
 
 @pytest.mark.parametrize(("robot", "low", "high"), [("h1", 0.0, 0.2), ("x1", 0.3, 0.7)])

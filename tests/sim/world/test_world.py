@@ -163,6 +163,8 @@ def test_contents_of_open_and_closed_receptacles() -> None:
     assert not world.object("Fridge_1").is_open
     assert world.containment.free_spot("Fridge_1", 0.05) is None  # the door is closed
     assert world.containment.total_mass_kg("Bowl_1") == pytest.approx(0.47 + 0.05)
+    table_kg = world.object("DiningTable_1").mass_kg
+    assert world.containment.total_mass_kg("DiningTable_1") == pytest.approx(table_kg + 0.47 + 0.05)
 
 
 @pytest.mark.parametrize("receptacle", ["Fridge_1", "Cabinet_1", "Drawer_1", "Microwave_1"])
@@ -242,6 +244,15 @@ def test_knob_heats_and_tap_fills_and_fridge_cools() -> None:
     assert state["Potato_1"]["isCooked"] and state["Potato_1"]["temperature"] == "Hot"
     assert state["Mug_1"]["fillLiquid"] == "water" and state["SinkBasin_1"]["isFilledWithLiquid"]
     assert state["Apple_1"]["temperature"] == "Cold"
+
+
+def test_a_microwave_cooks_behind_its_door() -> None:
+    food = ObjectPlacement("Potato_1", "Microwave_1")
+    for openness in (True, False):
+        world = _furnished(food, states={"Microwave_1": {"isOpen": openness}})
+        world.states.set_state("Microwave_1", "isToggled", True)
+        world.advance(15.0)
+        assert world.object("Potato_1").state.isCooked is not openness
 
 
 def test_fall_breaks_what_is_breakable() -> None:
