@@ -11,11 +11,12 @@ export WANDB_MODE ?= offline
 # Model weights come from this repository or from a path you give, never from a hub.
 export HF_HUB_OFFLINE ?= 1
 XDIST := -n auto --maxprocesses=4 --dist=worksteal
+EXTRAS := smplx==0.1.28 xgrammar==0.2.8 apache-tvm-ffi==0.1.15.post2 holosoma-retargeting==0.1.0
 QUICK := tests/configs tests/interface tests/model tests/planners tests/report \
   $(addprefix --ignore=tests/,$(addprefix report/test_,export.py figures.py notebook.py reconstruction.py tokenizer.py video.py) \
   $(addprefix planners/,chat/dag_plan/test_episode.py scripted/test_planner.py test_released.py))
 
-.PHONY: setup eval test test-slow quick check mutants release-check serve motions lock pictures docs reproduce third-party clean
+.PHONY: setup eval test test-slow test-extras quick check mutants release-check serve motions lock pictures docs reproduce third-party clean
 
 setup: $(STAMP)
 
@@ -36,6 +37,12 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest $(XDIST) -m slow $(PYTEST_ARGS)
+
+# The tests of what the environment goes without: SMPL-X, grammar-constrained replies, real motion clips.
+test-extras: $(STAMP)
+	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target $(VENV)/extras $(EXTRAS)
+	PYTHONPATH=$(VENV)/extras $(BIN)/python -m pytest $(XDIST) $(PYTEST_ARGS) \
+	  $(addprefix tests/,data/test_amass.py data/test_omomo.py data/test_retarget.py backends/test_grammar.py)
 
 # What needs no simulator, for the minute between two edits.
 quick: $(STAMP)
@@ -62,7 +69,7 @@ serve: $(STAMP)
 
 # Real human motion (two OMOMO clips, five climbing clips), data only: 100 MB, used by tests marked `motions`.
 motions: $(STAMP)
-	$(BIN)/python -m pip install --quiet --no-deps holosoma-retargeting==0.1.0
+	$(BIN)/python -m pip install --quiet --no-deps $(filter holosoma%,$(EXTRAS))
 
 # Re-pins the environment from pyproject.toml. torch stays at the version that has a CPU build.
 lock: $(STAMP)

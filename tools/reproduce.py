@@ -1,18 +1,17 @@
 """A table of the paper from nothing: `make reproduce TABLE=main` (replanning, ablation, failures, distributions).
 
 Runs what the table needs and what is not there, and says before it starts how long that takes; prints the table, and beside
-each figure that docs/benchmark.md gives whether the rerun agrees: whether its share lies within the published interval. What
+each published run (docs/results) whether the rerun agrees: whether its share lies within the published interval. What
 needs a language model behind an API or a folder of weights that is not there is named and left out.
 """
 
 from __future__ import annotations
 
-import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import eval as evaluation
 from configs.arguments import command, read_arguments
@@ -20,8 +19,8 @@ from configs.compose import compose
 from configs.schema.eval import CHAT_KINDS, EvalConfig
 from configs.validate import build
 from proprio_mllm.report.runs import newest
-from proprio_mllm.report.statistics import wilson
 from proprio_mllm.report.stored import Run, find_runs
+from tools.publish import results
 
 EXPERIMENTS: Final = {
     "main": "main_table",
@@ -34,9 +33,8 @@ EXPERIMENTS: Final = {
 _SECONDS: Final = {"expert": 1.5, "scripted": 1.3, "random": 2.0, "words": 2.6}
 _MODEL_SECONDS: Final = 4.3
 _CORES: Final = 2
-PUBLISHED: Final = Path(__file__).parents[1] / "docs" / "benchmark.md"
-#: Rows of the published table by planner.
-_ROWS: Final = {
+#: Planners of the published table, by the name of their row.
+PLANNERS: Final = {
     "random legal actions": "random",
     "Proprio-MLLM": "proprio",
     "language model, words alone": "words",
@@ -97,18 +95,19 @@ def needed(table: str) -> Iterator[Needed]:
                 yield Needed(planner, robot, difficulty, reason)
 
 
-def agreements(runs: Sequence[Run], published: str) -> Iterator[str]:
-    """A line for each published success rate of which there is a complete run."""
-    for label, robot, successes, tasks in re.findall(r"^\| ([^|]+?) \| (\w+) \| (\d+)/(\d+) = ", published, re.MULTILINE):
-        run = newest(runs, _ROWS[label], robot.lower(), "easy") if label in _ROWS else None
-        if run is None or not run.complete:
+def agreements(runs: Sequence[Run], results: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """A line for each published run that has been made again."""
+    for result in results.values():
+        settings = tuple(result[name] for name in ("planner", "robot", "difficulty", "category", "reflection"))
+        run = newest(runs, *settings)
+        again = None if run is None else run.row(result["category"])
+        if run is None or again is None or again.episodes != run.planned(result["category"]):
             continue
-        low, high = wilson(int(successes), int(tasks))
-        again = sum(record.outcome.value == "success" for record in run.records)
-        verdict = "agrees" if low <= again / len(run.records) <= high else "DIFFERS"
+        row = result["rows"][result["category"]]
+        verdict = "agrees" if row["low"] <= again.success_rate <= row["high"] else "DIFFERS"
         yield (
-            f"{_ROWS[label]} on {robot}: published {successes}/{tasks} [{low:.0%}, {high:.0%}], "
-            f"here {again}/{len(run.records)}: {verdict}"
+            f"{' '.join(settings)}: published {row['successes']}/{row['episodes']} [{row['low']:.0%}, {row['high']:.0%}], "
+            f"here {again.successes}/{again.episodes}: {verdict}"
         )
 
 
@@ -130,7 +129,7 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     failed = sum(evaluation.main([*one.words, f"output={config.output}"]) != 0 for one in missing)
     failed += evaluation.main([f"experiment={EXPERIMENTS[config.table]}", f"output={config.output}"]) != 0
-    lines = list(agreements(find_runs(Path(config.output)), PUBLISHED.read_text(encoding="utf-8")))
+    lines = list(agreements(find_runs(Path(config.output)), results()))
     sys.stdout.write("\n".join(lines) + "\n")
     return 1 if failed or any(line.endswith("DIFFERS") for line in lines) else 0
 

@@ -23,12 +23,13 @@ from typing import Any, Final
 from tqdm import tqdm
 
 import configs
+from configs.origin import PROVENANCE, origin
 from configs.schema.backend import BackendConfig
 from configs.schema.checks import defaults_of
 from configs.schema.eval import CHAT_KINDS, EvalConfig, PlannerConfig
 from data.cluster import import_ray
 from data.code_files import source_digest, split_source
-from data.files import file_hash, write_text
+from data.files import file_hash, read_json, write_text
 from interface.episode import EpisodeRecord, Outcome
 from proprio_mllm.backends.factory import check_cap, make_backend, told_revision
 from proprio_mllm.backends.identity import identity_of
@@ -80,7 +81,7 @@ def found(path: str) -> Path:
 
 
 def _decides(path: Path) -> bool:
-    return path.suffix in (".safetensors", ".json", ".jinja", ".txt") and path.name != "provenance.json"
+    return path.suffix in (".safetensors", ".json", ".jinja", ".txt") and path.name != PROVENANCE
 
 
 def weights_digest(folder: Path) -> str:
@@ -207,6 +208,7 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, own_hash
     return {
         "version": RUN_VERSION,
         "physics": PHYSICS,
+        **origin(),
         "planner": cfg.planner.name,
         "label": _label(cfg),
         "privileged": cfg.planner.kind == "expert",
@@ -261,6 +263,9 @@ def _resolved(planner: PlannerConfig, backend: BackendConfig | None) -> tuple[Pl
     if planner.weights is None:
         return planner, ""
     folder = check_weights(found(planner.weights), planner.train)
+    learnt_in = read_json(folder / PROVENANCE).get("physics") if (folder / PROVENANCE).is_file() else None
+    if learnt_in not in (None, PHYSICS):
+        logger.warning("%s learnt from episodes of physics %s, this is physics %s", folder, learnt_in, PHYSICS)
     return dataclasses.replace(planner, weights=str(folder.absolute())), weights_digest(folder)
 
 

@@ -89,6 +89,8 @@ def write_report(run: Run) -> Table:
                 "stuck",
                 "seed",
                 "physics",
+                "commit",
+                "processor",
             )
         }
         | {"split": meta.get("split", "all")},

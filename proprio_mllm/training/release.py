@@ -1,14 +1,13 @@
 """Released weights: a finished stage's model as a small folder with where it comes from, and how a loader finds it.
 
     weights/<model>/<name>/     what `building.save_model` wrote, and
-        provenance.json         seed, keys and hashes of data and configuration, versions, and for every stage that went into
-                                the model its command and its metrics
+        provenance.json         seed, keys and hashes of data and configuration, physics of its episodes, versions, commit and
+                                processor of the release, and for every stage that went into the model its command and metrics
         README.md               the same for people, in Hugging Face's format
 
 Weights are stored as float16, half the size; they are read back as float32. A variant's backbone is the base model's, which is
 released beside it, so that its own folder holds only what training moved. The motion tokenizer keeps its precision, so that
-it gives the same tokens as in training, and the critic of stage 3 is left out: a planner does not need it. Git is not asked:
-hashes of data and configuration say what made the weights.
+it gives the same tokens as in training, and the critic of stage 3 is left out: a planner does not need it.
 """
 
 from __future__ import annotations
@@ -21,7 +20,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
+from configs.origin import PROVENANCE, origin
 from data.files import new_folder, read_json
+from data.shards import Manifest
 from proprio_mllm.model.building import share_backbone, write_stored
 from proprio_mllm.model.tensors import read_tensors, write_tensors
 from proprio_mllm.training.card import model_card
@@ -76,7 +77,7 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
             if stage not in ("practice", "base") and (work / "vlm").is_dir():
                 share_backbone(work, target.with_name(release_name("base", "")))
             provenance = _provenance(pipeline, stage, key)
-            (work / "provenance.json").write_text(json.dumps(provenance, indent=1) + "\n", encoding="utf-8")
+            (work / PROVENANCE).write_text(json.dumps(provenance, indent=1) + "\n", encoding="utf-8")
             (work / "README.md").write_text(model_card(provenance), encoding="utf-8")
             size = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) / 1e6
             if size > LARGEST_MB:
@@ -86,7 +87,7 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
 
 
 def _released_key(target: Path) -> str | None:
-    path = target / "provenance.json"
+    path = target / PROVENANCE
     return str(read_json(path)["key"]) if path.is_file() else None
 
 
@@ -104,11 +105,12 @@ def _shrink(folder: Path) -> None:
 
 
 def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
-    shards = {}
+    shards, physics = {}, None
     for kind in ("clips", "views", "lessons", "practice"):
         folder = pipeline.paths.shards(kind)
         if (folder / "manifest.json").is_file():
             shards[kind] = shard_hash(folder)
+            physics = Manifest.load(folder).metadata.get("physics", physics)
     stages = {}
     for name in pipeline.ancestors(stage):
         record = read_json(pipeline.paths.stage(name) / "done.json")
@@ -119,6 +121,8 @@ def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
         "key": key,
         "seed": pipeline.cfg.seed,
         "shards": shards,
+        "physics": physics,
+        **origin(),
         "stages": stages,
         "stored_as": "float16",
         "config": dataclasses.asdict(pipeline.cfg),

@@ -81,7 +81,9 @@ def collect(config: CollectConfig, progress: Callable[[int, int], None] | None =
 
 def _metadata(config: CollectConfig) -> dict[str, Any]:
     if config.kind != "views":
-        return {}
+        from sim.scene.compiler import PHYSICS
+
+        return {"physics": PHYSICS}
     from sim.collection.view_sampling import type_names
 
     return {"type_names": list(type_names())}

@@ -8,7 +8,8 @@ import pytest
 
 from proprio_mllm.report.stored import find_runs
 from tests.report.conftest import make_record, store_run
-from tools.reproduce import EXPERIMENTS, PUBLISHED, agreements, main, needed
+from tools.publish import results
+from tools.reproduce import EXPERIMENTS, agreements, main, needed
 
 
 @pytest.mark.parametrize("table", EXPERIMENTS)
@@ -33,24 +34,21 @@ def test_a_rerun_agrees_within_the_published_interval(tmp_path: Path) -> None:
         folder = tmp_path / "eval" / f"{planner}-{robot}"
         folder.mkdir(parents=True)
         store_run(folder, [make_record(f"t{n}", "single", n < successes, planner=planner, robot=robot) for n in range(100)])
-    text = "\n".join(
-        f"| {label} | {robot} | {successes}/359 = 9 % [1, 2] | more |"
-        for label, robot, successes in (
-            ("language model, words alone", "H1", 279),
-            ("Proprio-MLLM", "H1", 235),
-            ("random legal actions", "X1", 0),
-            ("scripted rules", "H1", 342),
-            ("something else", "H1", 1),
-        )
-    )
-    lines = list(agreements(find_runs(tmp_path), text))
-    assert [line.split(":")[0] for line in lines] == ["words on H1", "proprio on H1", "random on X1"]
+    rows = {"words": 279, "proprio": 235, "random": 0, "scripted": 342}
+    published = {
+        planner: {"planner": planner, "robot": "x1" if planner == "random" else "h1", "difficulty": "easy", "category": "all"}
+        | {"reflection": "on", "rows": {"all": {"successes": n, "episodes": 359, "low": low, "high": high}}}
+        for (planner, n), (low, high) in zip(rows.items(), ((0.73, 0.82), (0.6, 0.7), (0.0, 0.01), (0.93, 0.97)), strict=True)
+    }
+    lines = list(agreements(find_runs(tmp_path), published))
+    assert [line.split()[0] for line in lines] == ["words", "proprio", "random"]  # of the rules there is no run
     assert [line.split()[-1] for line in lines] == ["agrees", "DIFFERS", "agrees"]
+    assert lines[0].startswith("words h1 easy all on: published 279/359 [73%, 82%], here 77/100")
 
 
-def test_the_published_table_is_read(tmp_path: Path) -> None:
-    folder = tmp_path / "eval" / "expert"
+def test_what_is_published_is_found(tmp_path: Path) -> None:
+    folder = tmp_path / "eval" / "scripted"
     folder.mkdir(parents=True)
-    store_run(folder, [make_record(f"t{n}", "single", n < 358, planner="expert") for n in range(359)])
-    (line,) = agreements(find_runs(tmp_path), PUBLISHED.read_text())
-    assert line.startswith("expert on H1: published 358/359") and line.endswith("here 358/359: agrees")
+    store_run(folder, [make_record(f"t{n}", "single", n < 342, planner="scripted") for n in range(359)])
+    (line,) = agreements(find_runs(tmp_path), results())
+    assert line.startswith("scripted h1 easy all on: published 342/359") and line.endswith("here 342/359: agrees")

@@ -1,0 +1,106 @@
+"""What README.md and docs/benchmark.md say of runs is what the runs' own files say."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from proprio_mllm.report.statistics import compare
+from tools.publish import results
+from tools.reproduce import PLANNERS
+
+ROOT = Path(__file__).parents[2]
+RESULTS = results()
+#: Runs whose files have not been kept yet.
+UNFILED = ("random", "expert")
+BENCHMARK, README = ((ROOT / name).read_text(encoding="utf-8") for name in ("docs/benchmark.md", "README.md"))
+
+
+def percent(share: float) -> str:
+    """Whole, unless that would say all of what is not."""
+    return f"{share:.1%}".replace("%", " %") if 0.995 <= share < 1.0 else f"{share:.0%}".replace("%", " %")
+
+
+def counted(row: dict[str, Any], key: str, rate: str) -> str:
+    low, high = (f"{100 * row[name]:.0f}" for name in (f"{rate}low", f"{rate}high"))
+    return f"{row[key]}/{row['episodes']} = {percent(row[key] / row['episodes'])} [{low}, {high}]"
+
+
+def planner_row(label: str, result: dict[str, Any]) -> str:
+    """A row of the table of planners."""
+    row, rows = result["rows"]["all"], result["rows"]
+    cells = [label, result["robot"].upper(), counted(row, "successes", ""), counted(row, "in_time", "in_time_")]
+    for category in ("single", "optional", "essential"):
+        one = rows[category]
+        cells += [f"{one['successes']}/{one['episodes']}", str(one["in_time"])]
+    cells += [
+        f"{row['navigation']} / {row['body_adjustment']} / {row['logical']}",
+        f"{row['budget_exhausted']} / {row['stuck']}",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+@pytest.mark.parametrize("label", [label for label, planner in PLANNERS.items() if planner not in UNFILED])
+@pytest.mark.parametrize("robot", ["h1", "x1"])
+def test_the_table_of_planners(label: str, robot: str) -> None:
+    assert planner_row(label, RESULTS[f"{PLANNERS[label]}-{robot}-easy"]) in BENCHMARK.splitlines()
+
+
+def test_no_other_planner_is_in_the_table() -> None:
+    found = re.findall(r"^\| ([^|]+?) \| (?:H1|X1) \| \d+/359 =", BENCHMARK, re.MULTILINE)
+    assert sorted(found) == sorted(2 * list(PLANNERS))
+
+
+@pytest.mark.parametrize("planner", ["proprio", "words", "scripted"])
+def test_the_table_of_the_readme(planner: str) -> None:
+    shares = [percent(RESULTS[f"{planner}-{robot}-easy"]["rows"]["all"]["success_rate"]) for robot in ("h1", "x1")]
+    label = {"proprio": "Proprio-MLLM (", "words": "language model alone (", "scripted": "scripted rules", "expert": "expert"}[
+        planner
+    ]
+    (row,) = (line for line in README.splitlines() if line.startswith(f"| {label}"))
+    assert row.endswith(f" | {shares[0]} | {shares[1]} |")
+
+
+def pairs(name: str, other: str = "proprio-h1-easy") -> tuple[int, int, float]:
+    """Tasks that one solves and the other does not, the reverse, and the p-value."""
+    first, second = ({str(k): [float(digit)] for k, digit in enumerate(RESULTS[one]["solved"])} for one in (name, other))
+    compared = compare(first, second)
+    return len(compared.above), len(compared.below), compared.p_value
+
+
+@pytest.mark.parametrize("planner", ["proprio_no_cse", "proprio_no_mpe", "proprio_no_mpe_cse", "no_proprio"])
+def test_the_table_of_ablations(planner: str) -> None:
+    result = RESULTS[f"{planner}-h1-easy"]
+    every, essential = result["rows"]["all"], result["rows"]["essential"]
+    (line,) = (line for line in BENCHMARK.splitlines() if line.startswith(f"| `{planner}` "))
+    won, lost, p_value = pairs(f"{planner}-h1-easy")
+    cells = [cell.strip() for cell in line.split("|")[2:-1]]
+    assert cells[:2] == [f"{every['successes']}/359", str(every["in_time"])]
+    told = re.fullmatch(r"(\d+), (\d+) \(p = ([\d.]+)\)", cells[2])
+    assert (
+        told is not None and (int(told[1]), int(told[2])) == (won, lost) and float(told[3]) == pytest.approx(p_value, abs=0.006)
+    )
+    assert cells[3] == f"{100 * every['first_try_rate']:.1f} %"
+    assert cells[4] == f"{essential['successes']}/133"
+    assert cells[5] == f"{essential['navigation']} / {essential['body_adjustment']} / {essential['logical']}"
+
+
+def test_the_table_of_replanning() -> None:
+    for reflection, first in (("", "| with reflection |"), ("-no_reflection", "| without |")):
+        (line,) = (line for line in BENCHMARK.splitlines() if line.startswith(first))
+        for cell, difficulty in zip(line.split("|")[2:-1], ("easy", "medium", "hard"), strict=True):
+            name = f"proprio-h1-{difficulty}-essential{reflection}"
+            row = RESULTS[name if name in RESULTS else "proprio-h1-easy"]["rows"]["essential"]
+            low, high = 100 * row["low"], 100 * row["high"]
+            assert cell.strip() == f"{row['successes']} = {100 * row['success_rate']:.1f} % [{low:.1f}, {high:.1f}]"
+
+
+def test_files_name_no_machine() -> None:
+    for name, result in RESULTS.items():
+        assert re.fullmatch(r"python eval\.py( [\w.]+=[\w,.-]+)+", result["command"]), name
+        assert len(result["solved"]) == len(result["in_time"]) == result["rows"]["all"]["episodes"]
+        assert result["solved"].count("1") == result["rows"]["all"]["successes"]
+        assert result["physics"] == 2
