@@ -71,7 +71,7 @@ def pairs(name: str, other: str = "proprio-h1-easy") -> tuple[int, int, float]:
     return len(compared.above), len(compared.below), compared.p_value
 
 
-@pytest.mark.parametrize("planner", ["proprio_no_cse", "proprio_no_mpe", "proprio_no_mpe_cse", "no_proprio"])
+@pytest.mark.parametrize("planner", ["proprio_no_cse", "proprio_no_mpe", "proprio_no_mpe_cse", "no_proprio", "base"])
 def test_the_table_of_ablations(planner: str) -> None:
     result = RESULTS[f"{planner}-h1-easy"]
     every, essential = result["rows"]["all"], result["rows"]["essential"]
