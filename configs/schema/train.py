@@ -244,6 +244,8 @@ class TrainConfig:
         seed: seed of data order, initial weights and rollouts.
         threads: torch threads; 0 leaves torch's choice.
         micro_batches: into how many each step's batch is cut, to save memory or to be shared by processes; a multiple of these.
+        recompute: whether the backbone's activations are computed again in the backward pass instead of being kept.
+        shard: whether processes share the backbone's frozen layers (FSDP2); with released weights (`model.weights`) alone.
         overwrite: run a stage from its start although its output is current, or a checkpoint is there.
         release: folder the finished stages are exported to, None for no export.
         resume: continue an interrupted stage from its checkpoint.
@@ -268,10 +270,13 @@ class TrainConfig:
     seed: int = 0
     threads: int = 2
     micro_batches: int = 1
+    recompute: bool = False
+    shard: bool = False
     overwrite: bool = False
     release: str | None = None
     resume: bool = True
 
     def __post_init__(self) -> None:
         require(0 <= self.seed <= LARGEST_SEED, f"seed {self.seed} outside [0, {LARGEST_SEED}]")
+        require(not self.shard or self.model.weights is not None, "shard=true shares a frozen backbone; set model.weights")
         require(self.micro_batches >= 1, f"micro_batches {self.micro_batches} must be at least 1")

@@ -25,9 +25,10 @@ from tqdm import tqdm
 
 from configs.schema.train import LoopConfig
 from proprio_mllm.training.checkpoint import load_checkpoint, save_checkpoint
+from proprio_mllm.training.memory import is_sharded
 from proprio_mllm.training.metrics import MetricWriter
 from proprio_mllm.training.muon import Muon, linear_weights
-from proprio_mllm.training.processes import add_gradients, added, first_alone, from_first, processes, same_everywhere
+from proprio_mllm.training.processes import add_gradients, added, first_alone, from_first, largest, processes, same_everywhere
 
 logger = logging.getLogger(__name__)
 
@@ -145,6 +146,7 @@ def run_loop(
     trained = [parameter for parameter in module.parameters() if parameter.requires_grad]
     if not trained:
         raise ValueError(f"stage {objective.name!r} trains no parameter")
+    sharded = is_sharded(module)
     optimizer = make_optimizer(module, cfg)
     checkpoint = folder / "checkpoint"
     first, spent = load_checkpoint(checkpoint, module, optimizer, objective.key) if resume else (0, 0.0)
@@ -177,18 +179,23 @@ def run_loop(
             weights = [objective.weight(batch) for batch in batches]
             (whole,) = added([sum(weights)])
             found: dict[str, float] = {}
-            for number, (batch, weight) in enumerate(zip(batches, weights, strict=True)):
+            parts = [batch if isinstance(batch, Parts) else Parts((batch,)) for batch in batches]
+            passes = sum(map(len, parts))
+            idle = largest(passes) - passes if sharded else 0
+            for number, (batch, weight) in enumerate(zip(parts, weights, strict=True)):
                 draw_seed = (seed * 1_000_003 + step) * 64 + rank + number * count
                 generator = torch.Generator().manual_seed(draw_seed)
                 torch.manual_seed(draw_seed)  # dropout draws from torch's own
                 share = weight / whole if whole else 0.0
-                for part in batch if isinstance(batch, Parts) else (batch,):
+                for part in batch:
                     with torch.autocast(device.type, torch.bfloat16, enabled=cfg.precision == "bf16"):
                         loss, values = objective.loss(module, _moved(part, device), generator)
                     (loss * share).backward()
                     found["loss"] = found.get("loss", 0.0) + float(loss.detach()) * share
                     for name, value in values.items():
                         found[name] = found.get(name, 0.0) + value / len(batches)
+            for _ in range(idle):  # a layer is gathered by all processes or by none
+                (0.0 * objective.loss(module, _moved(parts[0][0], device), torch.Generator())[0]).backward()
             (found["loss"],) = added([found["loss"]])
             if not math.isfinite(found["loss"]):
                 raise FloatingPointError(f"{objective.name}: loss {found['loss']} at step {step}; lower lr ({cfg.lr})")

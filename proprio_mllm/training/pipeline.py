@@ -20,6 +20,7 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.loop import Objective, run_loop
+from proprio_mllm.training.memory import spare_memory
 from proprio_mllm.training.metrics import MetricWriter
 from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_key
 from proprio_mllm.training.processes import first_alone, from_first, processes
@@ -228,6 +229,7 @@ class Pipeline:
     def loop(self, objective: Objective, cfg: LoopConfig, folder: Path) -> None:
         """Runs one objective with this configuration's seed and logger."""
         first_alone(lambda: folder.mkdir(parents=True, exist_ok=True))
+        spare_memory(objective.module, self.cfg.recompute, self.cfg.shard)
         about = {"key": objective.key}
         writer = MetricWriter(folder, objective.name, self.cfg.logger, about) if processes().is_main_process else None
         resume = self.cfg.resume and not self.cfg.overwrite

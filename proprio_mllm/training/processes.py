@@ -58,6 +58,15 @@ def from_first(values: Sequence[float]) -> list[float]:
     return told.tolist()
 
 
+def largest(value: int) -> int:
+    """The largest that any process says."""
+    state = processes()
+    told = torch.tensor(value, device=state.device)
+    if state.num_processes > 1:
+        dist.all_reduce(told, dist.ReduceOp.MAX)
+    return int(told)
+
+
 def add_gradients(parameters: Sequence[nn.Parameter]) -> None:
     """Adds gradients over all processes; a parameter that no process has one for keeps none."""
     if processes().num_processes == 1:

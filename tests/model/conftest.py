@@ -40,8 +40,7 @@ def one_thread() -> None:
     torch.set_num_threads(1)
 
 
-@pytest.fixture
-def cfg() -> ModelConfig:
+def small() -> ModelConfig:
     return ModelConfig(
         name="test",
         vocab_size=380,
@@ -53,6 +52,11 @@ def cfg() -> ModelConfig:
         point_map=PointMapConfig(encoder="sim", width=32, depth=1),
         motion=MotionTokenizerConfig(features=6, window=16, codes=16, code_dim=8, width=8, depth=1),
     )
+
+
+@pytest.fixture
+def cfg() -> ModelConfig:
+    return small()
 
 
 @pytest.fixture(scope="session")
