@@ -72,6 +72,15 @@ def run(cfg: TrainConfig) -> dict[str, Any]:
     """Runs the asked stages; returns the metrics of those that ran."""
     from proprio_mllm.training.processes import first_alone
 
+    if cfg.footprint is not None:
+        from proprio_mllm.training.footprint import footprint
+        from proprio_mllm.training.pipeline import StageError
+
+        try:
+            sys.stdout.write(footprint(cfg).text(cfg.footprint))
+        except ValueError as error:
+            raise StageError(str(error)) from error
+        return {}
     if cfg.stage in ("all", "data"):
         first_alone(lambda: make_data(cfg))
     if cfg.stage in ("all", "collect"):

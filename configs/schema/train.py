@@ -31,7 +31,7 @@ class LoopConfig:
 
     Attributes:
         steps: optimiser steps.
-        batch: examples per step and process.
+        batch: examples per step, of all processes together.
         lr: peak learning rate, reached after `warmup` steps, then a cosine down to a tenth of it.
         warmup: steps of linear warm-up.
         weight_decay: on matrices only.
@@ -246,6 +246,7 @@ class TrainConfig:
         micro_batches: into how many each step's batch is cut, to save memory or to be shared by processes; a multiple of these.
         recompute: whether the backbone's activations are computed again in the backward pass instead of being kept.
         shard: whether processes share the backbone's frozen layers (FSDP2); with released weights (`model.weights`) alone.
+        footprint: prints what alignment costs, on GPUs that reach so many TFLOP/s each, and trains nothing; None trains.
         overwrite: run a stage from its start although its output is current, or a checkpoint is there.
         release: folder the finished stages are exported to, None for no export.
         resume: continue an interrupted stage from its checkpoint.
@@ -272,11 +273,15 @@ class TrainConfig:
     micro_batches: int = 1
     recompute: bool = False
     shard: bool = False
+    footprint: float | None = None
     overwrite: bool = False
     release: str | None = None
     resume: bool = True
 
     def __post_init__(self) -> None:
         require(0 <= self.seed <= LARGEST_SEED, f"seed {self.seed} outside [0, {LARGEST_SEED}]")
+        require(
+            self.footprint is None or self.footprint > 0.0, f"footprint {self.footprint} must be positive: TFLOP/s of a GPU"
+        )
         require(not self.shard or self.model.weights is not None, "shard=true shares a frozen backbone; set model.weights")
         require(self.micro_batches >= 1, f"micro_batches {self.micro_batches} must be at least 1")

@@ -1,11 +1,53 @@
-"""Configuration of a Qwen2.5-VL backbone that is trained from scratch: the released architecture with small numbers."""
+"""Configurations of Qwen2.5-VL backbones: small ones that are trained from scratch, and the released ones' shapes."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
 
 from transformers import Qwen2_5_VLConfig
 
 from configs.schema.model import ModelConfig
 from proprio_mllm.model.processor import ProprioProcessor
+
+#: Language models of the released weights (their config.json): width, inner width, layers, heads, their pairs, rows, tied rows.
+PUBLISHED: Final[Mapping[str, tuple[int, int, int, int, int, int, bool]]] = {
+    "Qwen/Qwen2.5-VL-3B-Instruct": (2048, 11008, 36, 16, 2, 151936, True),
+    "Qwen/Qwen2.5-VL-7B-Instruct": (3584, 18944, 28, 28, 4, 152064, False),
+}
+
+
+def given_config(weights: str, **text: Any) -> Qwen2_5_VLConfig:
+    """Configuration of weights that are given, without reading any: a folder's, or that of a released name.
+
+    Args:
+        weights: folder with a config.json, or a name of `PUBLISHED`.
+        text: fields of the language model that are to be others, such as `num_hidden_layers`.
+
+    Raises:
+        ValueError: when it is neither.
+    """
+    if (Path(weights) / "config.json").is_file():
+        config = Qwen2_5_VLConfig.from_pretrained(weights)
+        for name, value in text.items():
+            setattr(config.text_config, name, value)
+        return config
+    if weights not in PUBLISHED:
+        raise ValueError(f"no config.json in {weights!r}; names whose shape is known: {', '.join(PUBLISHED)}")
+    hidden, inner, layers, heads, pairs, rows, tied = PUBLISHED[weights]
+    shape = {
+        "vocab_size": rows,
+        "hidden_size": hidden,
+        "intermediate_size": inner,
+        "num_hidden_layers": layers,
+        "num_attention_heads": heads,
+        "num_key_value_heads": pairs,
+        "rope_parameters": {"rope_type": "default", "rope_theta": 1e6, "mrope_section": [16, 24, 24]},
+        "tie_word_embeddings": tied,
+    }
+    vision = {"depth": 32, "hidden_size": 1280, "num_heads": 16, "intermediate_size": 3420, "out_hidden_size": hidden}
+    return Qwen2_5_VLConfig(text_config=shape | text, vision_config=vision, tie_word_embeddings=tied)
 
 
 def backbone_config(cfg: ModelConfig, processor: ProprioProcessor) -> Qwen2_5_VLConfig:

@@ -165,7 +165,7 @@ def add_adapter(model: ProprioMLLM, name: str = "default", start: str | None = N
         model.vlm.add_adapter(name, lora)
     else:
         heads = {k: p.requires_grad for k, p in model.named_parameters() if not k.startswith("vlm.")}
-        with _names_of_old():
+        with quiet_peft():
             model.vlm = get_peft_model(model.core, lora, adapter_name=name)  # type: ignore[arg-type]  # peft's stub wants PreTrainedModel
         for key, parameter in model.named_parameters():
             if key in heads:
@@ -180,7 +180,7 @@ def add_adapter(model: ProprioMLLM, name: str = "default", start: str | None = N
 
 
 @contextmanager
-def _names_of_old() -> Iterator[None]:
+def quiet_peft() -> Iterator[None]:
     """PEFT asks Transformers by a name that has a newer one, which is nothing that a user could mend."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="`is_gradient_checkpointing` is deprecated", category=FutureWarning)
@@ -307,7 +307,7 @@ def load_model(folder: str | Path, adapter: str | None = None, trainable: bool =
         if isinstance(model.vlm, PeftModel):
             model.vlm.load_adapter(path, name, is_trainable=trainable)
         else:
-            with _names_of_old():
+            with quiet_peft():
                 model.vlm = PeftModel.from_pretrained(model.core, path, adapter_name=name, is_trainable=trainable)
     if adapter is not None or names:
         use_adapter(model, adapter if adapter is not None else names[0])

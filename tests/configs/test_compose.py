@@ -38,7 +38,7 @@ ALL = sorted(path.relative_to(CONFIG_DIR) for path in CONFIG_DIR.rglob("*.yaml")
 
 
 def test_count() -> None:
-    assert len(ALL) == 44, f"configs/ holds {len(ALL)} YAML files: {[str(path) for path in ALL]}"
+    assert len(ALL) == 45, f"configs/ holds {len(ALL)} YAML files: {[str(path) for path in ALL]}"
     assert set(groups()) == {*GROUP_ROOT, "contingency"}
 
 
@@ -60,7 +60,7 @@ def test_every_yaml_composes(path: Path) -> None:
     ("root", "override", "message"),
     [
         ("train", "stage=nap", r"stage: 'nap' is not allowed; allowed: all, data"),
-        ("train", "model=giant", r"model='giant' is not allowed; allowed: qwen2_5_vl_7b, tiny"),
+        ("train", "model=giant", r"model='giant' is not allowed; allowed: qwen2_5_vl_3b, qwen2_5_vl_7b, tiny"),
         ("train", "stagee=all", r"stagee: unknown key in 'stagee=all'; allowed: .*stage"),
         ("train", "model.mpe.mode=none", r"model\.mpe: mode|model\.mpe\.mode: 'none' is not allowed; allowed: mrope"),
         ("eval", "planner=oracle", r"planner='oracle' is not allowed; allowed: base, dag_plan, expert"),

@@ -1,10 +1,11 @@
 from pathlib import Path
 
 import pytest
-import yaml
 
 import configs
+from configs.compose import compose
 from configs.schema.model import ModelConfig
+from configs.schema.train import TrainConfig
 from configs.validate import build
 from proprio_mllm.model.building import build_model, build_processor
 
@@ -13,11 +14,11 @@ NAMES = sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
 
 def _load(name: str) -> ModelConfig:
-    return build(ModelConfig, yaml.safe_load((FOLDER / f"{name}.yaml").read_text()), "model")
+    return build(TrainConfig, compose("train", [f"model={name}"])).model
 
 
 def test_every_model_config_is_valid():
-    assert NAMES == ["qwen2_5_vl_7b", "tiny"]
+    assert NAMES == ["qwen2_5_vl_3b", "qwen2_5_vl_7b", "tiny"]
     for name in NAMES:
         assert _load(name).name == name
 
