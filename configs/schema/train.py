@@ -149,13 +149,11 @@ class AlignmentConfig:
         judge_share: share of judging questions among the decisions.
         questions: body-relative questions packed per image.
         mask: share of motion tokens hidden in masked motion.
-        rows: what the rows of motion tokens start from: drawn like those of other new tokens, or the tokenizer's codes.
     """
 
     text: LoopConfig
     image: LoopConfig
     joint: LoopConfig
-    rows: Literal["drawn", "codes"] = "drawn"
     plan_share: float = 0.7
     text_share: float = 0.3
     judge_share: float = 0.15

@@ -115,26 +115,6 @@ def build_model(
         return ProprioMLLM(vlm, cfg, processor, motion_ids, point_map)
 
 
-@torch.no_grad()
-def start_motion_rows(model: ProprioMLLM, tokenizer: MotionTokenizer, generator: torch.Generator) -> None:
-    """Starts the rows of motion tokens from the tokenizer's codes, so that what a code says is there to be read from the start.
-
-    A random map that about keeps distances turns codes into the embedding's space; they are scaled to the size of other rows.
-    What the codes of a step add up to, their rows do as well. Call before the first adapter is added.
-
-    Args:
-        model: its embedding changes.
-        tokenizer: whose codes they are.
-        generator: draws the map.
-    """
-    table: Any = model.core.get_input_embeddings().weight
-    codes = tokenizer.quantizer.vectors().to(table)  # (V, D)
-    ids = torch.tensor(model.motion_ids[-len(codes) :])
-    spread = torch.randn(codes.shape[1], table.shape[1], generator=generator).to(table) / codes.shape[1] ** 0.5
-    rows = (codes - codes.mean(0)) @ spread
-    table[ids] = rows * (table[: int(min(model.motion_ids))].std() / rows.std())
-
-
 def add_adapter(model: ProprioMLLM, name: str = "default", start: str | None = None) -> None:
     """Adds LoRA weights and trainable motion rows under a name and makes them the active adapter.
 

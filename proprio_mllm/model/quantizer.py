@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -99,13 +98,6 @@ class MotionQuantizer(nn.Module):
                 f"motion token {int(tokens[wrong][0])} outside the codebook [{place * cfg.codes}, {(place + 1) * cfg.codes})"
             )
         return self._codes(indices if cfg.quantizer == "rvq" else indices[..., 0])
-
-    def vectors(self) -> Tensor:
-        """(V, D), what each token of the vocabulary adds to the code of a step; on a grid, the code itself."""
-        if isinstance(self.inner, FSQ):
-            return self._codes(torch.arange(self.cfg.vocabulary))
-        books: Any = self.inner.layers if self.cfg.quantizer == "rvq" else [self.inner]
-        return torch.cat([book.codebook for book in books])
 
     def forward(self, vectors: Tensor, generator: torch.Generator | None = None) -> Quantised:
         """Quantises encodings (B, N, D); in training mode it also updates the codebooks.

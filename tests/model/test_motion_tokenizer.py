@@ -93,14 +93,6 @@ def test_residual_codebooks_pull_what_is_left_over_to_their_codes():
     torch.testing.assert_close(result.commitment_loss.detach(), expected)
 
 
-@pytest.mark.parametrize(("kind", "more"), [("vq", {}), ("rvq", {"stages": 2}), ("fsq", {"codes": 60, "levels": (5, 4, 3)})])
-def test_what_tokens_add_is_the_code_of_a_step(kind, more):
-    quantizer = _quantizer(quantizer=kind, **more)
-    quantizer(torch.randn(1, 40, 3))
-    tokens = quantizer.eval().tokens(torch.randn(1, 9, 3))
-    torch.testing.assert_close(quantizer.vectors()[tokens].sum(2), quantizer.lookup(tokens))
-
-
 def test_grid_tokens_are_the_rounded_values():
     quantizer = _quantizer(quantizer="fsq", codes=60, levels=(5, 4, 3)).eval()
     vectors = torch.randn(2, 9, 3)

@@ -123,25 +123,6 @@ def test_every_model_loads(trained: Pipeline) -> None:
         assert (model.cse is not None) is proprioception
 
 
-def test_rows_of_motion_tokens_may_start_from_the_codes(trained: Pipeline) -> None:
-    """Distances between rows are those between codes, about; other rows are as they were; a stored model has its rows."""
-    alignment = dataclasses.replace(trained.cfg.alignment, rows="codes")
-    drawn, coded = start(trained), start(Pipeline(STAGES, dataclasses.replace(trained.cfg, alignment=alignment)))
-    codes = MotionTokenizer.load(trained.paths.model("tokenizer")).quantizer.vectors()
-    ids = list(coded.motion_ids[-len(codes) :])
-    with torch.no_grad():
-        rows, others = (model.core.get_input_embeddings()(torch.tensor(ids)) for model in (coded, drawn))
-        kept = torch.ones(coded.core.get_input_embeddings().weight.shape[0], dtype=torch.bool)
-        kept[ids] = False
-        first, second = (model.core.get_input_embeddings()(kept.nonzero()[:, 0]) for model in (coded, drawn))
-    torch.testing.assert_close(first, second)
-    torch.testing.assert_close(rows.std(), first.std(), rtol=0.5, atol=0.0)  # as large as other rows, codes are not
-    assert float(codes.std() / rows.std()) > 2.0
-    far = torch.pdist(codes)
-    assert float(torch.corrcoef(torch.stack([far, torch.pdist(rows)]))[0, 1]) > 0.7
-    assert float(torch.corrcoef(torch.stack([far, torch.pdist(others)]))[0, 1]) < 0.3
-
-
 @pytest.mark.parametrize("phase", list(PHASES))
 def test_a_phase_changes_only_its_groups(trained: Pipeline, phase: str) -> None:
     from proprio_mllm.model.groups import group_of

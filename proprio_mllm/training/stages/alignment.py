@@ -7,15 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from proprio_mllm.model.building import (
     add_adapter,
     build_model,
     build_point_map,
     build_processor,
     load_model,
-    start_motion_rows,
 )
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
@@ -83,8 +80,5 @@ def start(pipeline: Pipeline) -> ProprioMLLM:
         model.cfg = cfg
     else:
         model = build_model(cfg, build_processor(cfg), pipeline.cfg.seed, point_map)
-    if cfg.proprioception and pipeline.cfg.alignment.rows == "codes":
-        tokenizer = MotionTokenizer.load(pipeline.paths.model("tokenizer"))
-        start_motion_rows(model, tokenizer, torch.Generator().manual_seed(pipeline.cfg.seed))
     seeded(lambda: add_adapter(model), pipeline.cfg.seed)
     return model
