@@ -9,6 +9,7 @@ Paper: none.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -96,7 +97,7 @@ def table(columns: Sequence[Column]) -> Table:
     out = Table()
     out.add_column("metric", no_wrap=True)
     for heading in (*(column.name for column in columns), "aim at most"):
-        out.add_column(heading)
+        out.add_column(heading, overflow="fold", min_width=5)
     for name, aim in TARGETS.items():
         values = [getattr(column.metrics, name) for column in columns]
         out.add_row(name, *("-" if np.isnan(v) else f"{v:.2f}" for v in values), aim)
@@ -138,7 +139,7 @@ def main(arguments: Sequence[str]) -> int:
         columns += [measure(f"{robot} {clip.name}", retargeter, [clip], physics) for clip in real]
         if level:
             columns.append(measure(f"{robot} climb, level parts", retargeter, level, physics))
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 220)
     console.print(table(columns))
     if not real:
         console.print("Real clips are not installed; run `make motions` for them.")
