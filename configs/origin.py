@@ -18,6 +18,8 @@ def origin() -> dict[str, str | None]:
 
 
 def _commit() -> str | None:
+    if not (_ROOT / ".git").exists():  # installed, perhaps inside somebody else's checkout
+        return None
     try:
         head, changed = (
             subprocess.run(["git", "-C", str(_ROOT), *words], capture_output=True, text=True, timeout=10, check=True).stdout

@@ -22,6 +22,7 @@ from proprio_mllm.evaluation.run import config_hash, evaluate, plan_episodes, ru
 from proprio_mllm.planners.protocol import WeightsError
 from proprio_mllm.report.runs import write_report
 from proprio_mllm.report.stored import load_run
+from sim.scene.compiler import PHYSICS
 from sim.tasks.task import write_tasks
 
 SCRIPT = Path(__file__).parent / "interrupted.py"
@@ -56,6 +57,20 @@ def test_runs_every_task_once_and_continues(cfg, session) -> None:
     more = evaluate(dataclasses.replace(cfg, limit=1), opener)
     assert [record.task for record in more.records] == ["t0", "t2", "t3"]
     assert more.folder != first.folder
+
+
+def test_weights_of_another_physics_are_told(cfg, session, tmp_path, caplog) -> None:
+    weights = tmp_path / "weights"
+    weights.mkdir()
+    (weights / "config.json").write_text("{}")
+    planner = PlannerConfig("p", "mllm", "P", str(weights), train="python train.py")
+    for physics, told in ((PHYSICS, False), (PHYSICS - 1, True), (None, False)):
+        (weights / "provenance.json").write_text(json.dumps({"physics": physics}))
+        caplog.clear()
+        running._resolved(planner, None)
+        assert (f"learnt from episodes of physics {physics}, this is physics {PHYSICS}" in caplog.text) is told
+    about = json.loads((evaluate(cfg, lambda *_: session()).folder / "run.json").read_text())
+    assert about["physics"] == PHYSICS and about["processor"] and "commit" in about
 
 
 def test_a_run_under_way_keeps_its_plan(cfg, session, tmp_path) -> None:
