@@ -33,14 +33,6 @@ EXPERIMENTS: Final = {
 _SECONDS: Final = {"expert": 1.5, "scripted": 1.3, "random": 2.0, "words": 2.6}
 _MODEL_SECONDS: Final = 4.3
 _CORES: Final = 2
-#: Planners of the published table, by the name of their row.
-PLANNERS: Final = {
-    "random legal actions": "random",
-    "Proprio-MLLM": "proprio",
-    "language model, words alone": "words",
-    "scripted rules": "scripted",
-    "expert (privileged)": "expert",
-}
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ from interface.steps import Action, PlanStep
 from proprio_mllm.planners.protocol import TaskInfo
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 from proprio_mllm.training.rollouts import DaggerRequest
+from sim.scene.compiler import PHYSICS
 
 #: Episodes of a part.
 _PER_PART: Final = 10
@@ -97,7 +98,7 @@ def _write(
     for done, (part, rows) in enumerate(_computed(job, missing, config.workers), total - len(missing) + 1):
         writer.write(part, rows)
         progress(done, total)
-    return writer.finish({**about, "foreseen": True} if config.foreseen else about)
+    return writer.finish({**about, "physics": PHYSICS} | ({"foreseen": True} if config.foreseen else {}))
 
 
 def _lessons(config: CollectConfig, part: int, student: str | None = None) -> list[dict[str, Any]]:

@@ -4,8 +4,8 @@ Nothing is loaded and nothing computed: the model is built on the meta device, w
 pass forward and backward through two layers of its language model says what a layer computes and keeps. The rest is arithmetic.
 An example is a decision with a picture, its log in text, and motion, the longest that stage 2 trains on.
 
-Left out: CUT3R, whose weights are the user's; what the allocator and the kernels' workspaces take (some GB on a GPU); attention
-is counted as the plain kernel keeps it, which fused kernels do not.
+Left out: CUT3R, whose weights are the user's; the vision tower's attention; what the allocator and the kernels' workspaces take
+(some GB on a GPU). The language model's attention is counted as the plain kernel keeps it, which fused kernels do not.
 """
 
 from __future__ import annotations
@@ -37,7 +37,6 @@ _TEXT_TOKENS: Final = 253
 _CUT3R_TOKENS: Final = 768
 #: Bytes per trained parameter besides its weight: gradient and AdamW's two moments, float32.
 _TRAINING_BYTES: Final = 12
-_LAYERS: Final = (1, 2)
 _GPUS: Final = (1, 8, 64)
 
 
@@ -62,7 +61,8 @@ class Footprint:
     Attributes:
         parts: by name.
         tokens: of an example: visual, text, motion.
-        flop: of an example's passes forward and backward; with `recompute`, once more forward.
+        reading: FLOP of the language model for an example, forward and backward; with `recompute`, once more forward.
+        seeing: FLOP of the frozen vision tower, forward, and of merger and CSE, forward and backward.
         activations: bytes that an example keeps for the backward pass.
         shared: bytes of the frozen layers, which `shard=true` spreads.
         cfg: what is trained.
@@ -70,10 +70,16 @@ class Footprint:
 
     parts: Mapping[str, Part]
     tokens: tuple[int, int, int]
-    flop: float
+    reading: float
+    seeing: float
     activations: int
     shared: int
     cfg: TrainConfig
+
+    @property
+    def flop(self) -> float:
+        """Of an example."""
+        return self.reading + self.seeing
 
     def gigabytes(self, gpus: int) -> float:
         """Memory per GPU: weights, gradients, optimiser and activations of a micro-batch."""
@@ -131,38 +137,35 @@ def footprint(cfg: TrainConfig) -> Footprint:
     with torch.device("meta"):
         vlm: Any = Qwen2_5_VLForConditionalGeneration(full)
         heads = _heads(model, full.text_config.hidden_size)
+    text, seen = full.text_config, full.vision_config
     vocabulary = len(motion_tokens(model.motion.vocabulary)) if model.proprioception else 0
+    rows = vocabulary * text.hidden_size * (1 if full.tie_word_embeddings else 2)
     width = getattr(torch, model.dtype).itemsize
-    tied = full.tie_word_embeddings
-    blocks, merger = _count(vlm.model.visual.blocks), _count(vlm.model.visual.merger)
+    blocks, merger, vision = (_count(one) for one in (vlm.model.visual.blocks, vlm.model.visual.merger, vlm.model.visual))
     layers = _count(vlm.model.language_model.layers)
     lora = sum(
         model.lora.rank * (one.in_features + one.out_features)
         for name, one in vlm.named_modules()
         if isinstance(one, nn.Linear) and re.fullmatch(LORA_TARGETS, name)
     )
-    rows = vocabulary * full.text_config.hidden_size * (1 if tied else 2)
-    everything = _count(vlm)
     parts = {
         "language model's layers": Part(layers, 0, width),
-        "vision tower": Part(_count(vlm.model.visual) - merger, 0, width),
+        "vision tower": Part(vision - merger, 0, width),
         "merger": Part(merger, merger, width),
-        "tables and last norm": Part(everything - layers - _count(vlm.model.visual), 0, width),
+        "tables and last norm": Part(_count(vlm) - layers - vision, 0, width),
         "LoRA": Part(lora, lora, 4),
         "rows of motion tokens": Part(rows, rows, 4),
         **{name: Part(_count(head), 0 if name == "point map" else _count(head), 4) for name, head in heads.items()},
     }
-    side = model.image_size // (full.vision_config.patch_size * full.vision_config.spatial_merge_size)
-    visual, motion = side * side, _motion_tokens(model)
-    tokens = (visual, _TEXT_TOKENS, motion)
-    length = sum(tokens)
-    once, passes, kept, inputs = _layer(model, length)
-    count = full.text_config.num_hidden_layers
-    patches = visual * full.vision_config.spatial_merge_size**2
-    seen = 2.0 * (blocks + merger) * patches
-    flop = count * (passes + (once if cfg.recompute else 0)) + seen
+    side = model.image_size // (seen.patch_size * seen.spatial_merge_size)
+    tokens = (side * side, _TEXT_TOKENS, _motion_tokens(model))
+    trained = merger + (parts["cross-spatial encoder"].trained if model.cse.enabled else 0)
+    seeing = tokens[0] * (2.0 * blocks * seen.spatial_merge_size**2 + 6.0 * trained)
+    once, both, kept = _layer(model, sum(tokens))
+    count, inputs = text.num_hidden_layers, sum(tokens) * text.hidden_size * width
+    reading = count * (both + (once if cfg.recompute else 0.0))
     activations = count * inputs + kept if cfg.recompute else count * kept
-    return Footprint(parts, tokens, flop, activations, (blocks + layers) * width, cfg)
+    return Footprint(parts, tokens, reading, seeing, activations, (blocks + layers) * width, cfg)
 
 
 def _config(model: ModelConfig, **text: Any) -> Any:  # transformers' type says too little of its parts
@@ -193,10 +196,10 @@ def _motion_tokens(model: ModelConfig) -> int:
     return model.motion.window // 2**model.motion.down * stages + 2
 
 
-def _layer(model: ModelConfig, length: int) -> tuple[float, float, int, int]:
-    """Of one layer with its adapter: FLOP forward, FLOP forward and backward, bytes kept, and bytes of its input."""
+def _layer(model: ModelConfig, length: int) -> tuple[float, float, int]:
+    """Of one layer with its adapter: FLOP forward, FLOP forward and backward, and bytes kept between them."""
     found: list[tuple[float, float, int]] = []
-    for layers in _LAYERS:
+    for layers in (1, 2):
         config = _config(model, num_hidden_layers=layers)
         with torch.device("meta"), quiet_peft():
             whole = Qwen2_5_VLForConditionalGeneration(config).to(getattr(torch, model.dtype))
@@ -205,8 +208,7 @@ def _layer(model: ModelConfig, length: int) -> tuple[float, float, int, int]:
         core.train()
         found.append(_measured(core.model.language_model, length))
     (once, both, kept), (more_once, more_both, more_kept) = found
-    inputs = length * _config(model).text_config.hidden_size * getattr(torch, model.dtype).itemsize
-    return more_once - once, more_both - both, more_kept - kept, inputs
+    return more_once - once, more_both - both, more_kept - kept
 
 
 def _measured(language_model: nn.Module, length: int) -> tuple[float, float, int]:

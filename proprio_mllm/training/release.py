@@ -105,12 +105,11 @@ def _shrink(folder: Path) -> None:
 
 
 def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
-    shards, physics = {}, None
+    shards = {}
     for kind in ("clips", "views", "lessons", "practice"):
         folder = pipeline.paths.shards(kind)
         if (folder / "manifest.json").is_file():
             shards[kind] = shard_hash(folder)
-            physics = Manifest.load(folder).metadata.get("physics", physics)
     stages = {}
     for name in pipeline.ancestors(stage):
         record = read_json(pipeline.paths.stage(name) / "done.json")
@@ -121,7 +120,7 @@ def _provenance(pipeline: Pipeline, stage: str, key: str) -> dict[str, Any]:
         "key": key,
         "seed": pipeline.cfg.seed,
         "shards": shards,
-        "physics": physics,
+        "physics": Manifest.load(pipeline.paths.shards("lessons")).metadata.get("physics"),
         **origin(),
         "stages": stages,
         "stored_as": "float16",

@@ -81,9 +81,7 @@ def collect(config: CollectConfig, progress: Callable[[int, int], None] | None =
 
 def _metadata(config: CollectConfig) -> dict[str, Any]:
     if config.kind != "views":
-        from sim.scene.compiler import PHYSICS
-
-        return {"physics": PHYSICS}
+        return {}
     from sim.collection.view_sampling import type_names
 
     return {"type_names": list(type_names())}

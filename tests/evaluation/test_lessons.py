@@ -20,6 +20,7 @@ from proprio_mllm.model.word_tokens import WordTokens, add_word_tokens
 from proprio_mllm.model.wording import answer_words, id_words, text_words
 from proprio_mllm.training.sources import held_out
 from sim.collection.text_world import TextWorld
+from sim.scene.compiler import PHYSICS
 from sim.tasks.families import FAMILIES
 from sim.tasks.sample import UNSEEN_TYPES
 
@@ -86,6 +87,7 @@ def test_what_was_foreseen_is_the_answer_with_a_picture_and_never_in_words_alone
     told = [_step(turn.answer) for episode in Lessons().told(tmp_path) for turn in episode.turns]
     assert told == [_step(answer_words("Pick", "", PlanStep.parse(target))) for target in targets]
     assert (targets != taught) == ahead == bool(reader.manifest.metadata.get("foreseen"))
+    assert reader.manifest.metadata["physics"] == PHYSICS
     alone = [_step(turn.answer) for turn in Lessons().logged(tmp_path)(-1).turns]
     assert all(step in [_step(answer_words("Pick", "", PlanStep.parse(text))) for text in taught] for step in alone)
 

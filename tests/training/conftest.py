@@ -149,7 +149,7 @@ def write_lessons(folder: Path, episodes: int = 40) -> Path:
             history.append({"step": text, "feedback": f"{text} ok"})
     writer = ShardWriter(folder, "demos", "test")
     writer.write(0, rows)
-    writer.finish({})
+    writer.finish({"physics": 2})
     return folder
 
 

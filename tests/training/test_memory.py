@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from proprio_mllm.training.memory import is_sharded, spare_memory
+from tests.training.kept import kept_bytes
 from tests.training.sharded import Mixed
 from tests.training.test_processes import alike, launched
 
@@ -31,20 +32,12 @@ def test_processes_share_frozen_layers(tmp_path: Path) -> None:
 def saved_bytes(objective: Mixed) -> tuple[int, dict[str, torch.Tensor]]:
     """Bytes that one forward pass keeps besides parameters, and the gradients."""
     objective.module.train()
-    own = {one.untyped_storage().data_ptr() for one in objective.module.parameters()}
-    kept: dict[int, int] = {}
-
-    def keep(tensor: torch.Tensor) -> torch.Tensor:
-        storage = tensor.untyped_storage()
-        if storage.data_ptr() not in own:
-            kept[storage.data_ptr()] = storage.nbytes()
-        return tensor
-
     (batch,) = objective.collator.in_parts(objective.examples(np.random.default_rng(3), 4, "see"), 1)
-    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+    with kept_bytes(objective.module) as kept:
         loss, _ = objective.loss(objective.module, batch, torch.Generator())
+    held = kept()
     loss.backward()
-    return sum(kept.values()), {name: one.grad for name, one in objective.module.named_parameters() if one.grad is not None}
+    return held, {name: one.grad for name, one in objective.module.named_parameters() if one.grad is not None}
 
 
 def test_activations_are_computed_again() -> None:

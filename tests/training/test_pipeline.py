@@ -235,6 +235,7 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert list(about["stages"]) == ["words", "practice", "base", "pointmap", "tokenizer", "alignment", "selu"]
     assert all(stage["command"] == "python train.py stage=all" and stage["metrics"] for stage in about["stages"].values())
     assert set(about["shards"]) == {"clips", "views", "lessons", "practice"}
+    assert about["physics"] == 2  # of the lessons
     ours, released = load_model(trained.paths.model("selu")), load_model(tmp_path / "tiny" / "full")
     theirs = dict(released.named_parameters())
     assert all(tensor.dtype == torch.float32 for tensor in theirs.values())
