@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,12 +16,12 @@ from torch.distributed.tensor import DTensor
 
 from configs.schema.train import LoopConfig
 from proprio_mllm.model.batch import Batch, Collator, Example
-from proprio_mllm.model.building import add_adapter, build_model, build_processor
+from proprio_mllm.model.building import add_adapter, build_model, build_processor, save_model
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.prompts import described_motion
 from proprio_mllm.training.loop import Objective, Parts, run_loop
 from proprio_mllm.training.memory import spare_memory
-from proprio_mllm.training.processes import processes
+from proprio_mllm.training.processes import first_alone, processes
 from tests.model.conftest import TEXTS, TYPES, make_view, small
 
 CFG = LoopConfig(steps=6, batch=8, lr=1e-2, warmup=1)
@@ -30,13 +32,14 @@ class Mixed(Objective):
 
     name, key = "mixed", "k"
 
-    def __init__(self, recompute: bool = False, shard: bool = False) -> None:
-        cfg = small()
+    def __init__(self, recompute: bool = False, shard: bool = False, weights: Path | None = None) -> None:
+        cfg = dataclasses.replace(small(), weights=None if weights is None else str(weights))
         model = build_model(cfg, build_processor(cfg, TEXTS, TYPES))
         torch.manual_seed(0)
         add_adapter(model)
         train_only(model, ("rows", "lora", "cse"))
         self.module: nn.Module = model
+        self.model = model
         self.collator = Collator(model.processor, cfg)
         spare_memory(model, recompute, shard)
 
@@ -65,15 +68,27 @@ class Mixed(Objective):
         return module(batch).loss, {}
 
 
-def main(folder: Path, micro_batches: int) -> None:
+def given(folder: Path) -> Path:
+    """A small backbone with its processor, as released weights are."""
+    cfg = small()
+    save_model(build_model(cfg, build_processor(cfg, TEXTS, TYPES)), folder)
+    shutil.copytree(folder / "processor", folder / "vlm", dirs_exist_ok=True)
+    return folder / "vlm"
+
+
+def main(folder: Path, micro_batches: int, weights: Path) -> None:
     torch.set_num_threads(1)
-    objective = Mixed(shard=True)
+    objective = Mixed(shard=True, weights=weights)
     run_loop(objective, CFG, folder, 0, None, micro_batches=micro_batches)
     trained = {name: one.detach().clone() for name, one in objective.module.named_parameters() if one.requires_grad}
     save_file(trained, folder / f"weights_{processes().process_index}.safetensors")
     held = sum((one.to_local() if isinstance(one, DTensor) else one).numel() for one in objective.module.parameters())
     (folder / f"held_{processes().process_index}").write_text(str(held))
+    model = objective.model.eval()
+    first_alone(lambda: save_model(model, folder / "model"))
+    asked = objective.collator(objective.examples(np.random.default_rng(1), 2, "see"), generation=True)
+    (folder / f"said_{processes().process_index}").write_text("\n".join(model.reply(asked, 6)))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]))
+    main(Path(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]))

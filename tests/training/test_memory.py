@@ -7,17 +7,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
+from proprio_mllm.model.building import load_model
 from proprio_mllm.training.memory import is_sharded, spare_memory
 from tests.training.kept import kept_bytes
-from tests.training.sharded import Mixed
+from tests.training.sharded import Mixed, given
 from tests.training.test_processes import alike, launched
 
 
 def test_processes_share_frozen_layers(tmp_path: Path) -> None:
-    """Two processes hold about half of the layers each, and train what one alone trains."""
+    """Two processes hold half of the layers each, train what one alone trains, store it, and plan with it."""
+    weights = str(given(tmp_path / "given"))
     for count in (1, 2):
-        assert launched(count, tmp_path / str(count), 2, module="tests.training.sharded") == [0] * count
+        assert launched(count, tmp_path / str(count), 2, weights, module="tests.training.sharded") == [0] * count
+    stored = load_model(tmp_path / "2" / "model")
+    assert isinstance(stored.cfg.weights, str)
+    for name, told in load_file(tmp_path / "1" / "weights_0.safetensors").items():
+        torch.testing.assert_close(stored.get_parameter(name).detach(), told, atol=2e-5, rtol=2e-4)
+    said = [(tmp_path / name).read_text() for name in ("1/said_0", "2/said_0", "2/said_1")]
+    assert said[0] and len(set(said)) == 1
     for rank in (0, 1):
         alike(tmp_path / "1" / "weights_0.safetensors", tmp_path / "2" / f"weights_{rank}.safetensors")
     whole, half = (int((tmp_path / name).read_text()) for name in ("1/held_0", "2/held_1"))
