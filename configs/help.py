@@ -113,9 +113,9 @@ def _shown(value: object) -> str:
 
 
 def _meanings(schema: type) -> dict[str, str]:
-    """Texts of a docstring's `Attributes:` section by field."""
+    """Texts of a docstring's `Attributes:` section by field, those of the classes it extends included."""
     _, _, section = textwrap.dedent((schema.__doc__ or "").partition("\n")[2]).partition("Attributes:\n")
-    found: dict[str, str] = {}
+    found: dict[str, str] = {name: text for base in schema.__bases__ for name, text in _meanings(base).items()}
     names: tuple[str, ...] = ()
     for line in section.splitlines():
         if line and not line.startswith(" "):

@@ -9,12 +9,12 @@ from typing import Final, Literal
 
 from configs.schema.backend import BackendConfig
 from configs.schema.checks import defaults_of, require, require_used
+from configs.schema.execution import Execution
 from configs.schema.robot import RobotConfig
 
 CategoryName = Literal["all", "single", "optional", "essential"]
 DifficultyName = Literal["easy", "medium", "hard", "natural"]
 SplitName = Literal["all", "seen", "unseen"]
-SchedulerName = Literal["local", "ray"]
 StartName = Literal["fixed", "turned", "random"]
 BlindName = Literal["none", "image", "motion", "both"]
 FeedbackName = Literal["codes", "bit"]
@@ -128,7 +128,7 @@ class ExperimentConfig:
 
 
 @dataclass(frozen=True)
-class EvalConfig:
+class EvalConfig(Execution):
     """Everything `eval.py` needs.
 
     Attributes:
@@ -144,16 +144,10 @@ class EvalConfig:
         start: `fixed` starts where the task says, `turned` there with a heading drawn per trial, `random` anywhere free in the
             room with heading and pelvis height drawn per trial.
         split: tasks whose `split` this is, or all.
-        workers: processes; 0 runs in this one.
-        scheduler: who runs the workers: `local` this machine's process pool, `ray` a Ray instance or cluster.
-        ray_address: a running cluster's address; None starts Ray on this machine for the run.
-        batch: planner calls answered together, for models in this project's processes. Above 1, `workers=0` runs so many
-            episodes side by side, and otherwise one process holds the model and answers the workers.
         seed: of the luck, hashed with task, robot and trial.
         tasks: `benchmark`, or the path of a JSON-lines file of tasks.
         limit: only the first so many tasks of each category.
         feedback: `codes` tells planners why an action failed, `bit` only that it did.
-        retries: how often an episode with an infrastructure error is run again.
         output: folder of all outputs.
         experiment: assemble this instead of running episodes.
         sanity: run two tasks on each robot with the expert, the rules and the tiny model, and keep nothing.
@@ -175,15 +169,10 @@ class EvalConfig:
     stuck: int = 8
     start: StartName = "fixed"
     split: SplitName = "all"
-    workers: int = 2
-    scheduler: SchedulerName = "local"
-    ray_address: str | None = None
-    batch: int = 1
     seed: int = 0
     tasks: str = "benchmark"
     limit: int | None = None
     feedback: FeedbackName = "codes"
-    retries: int = 1
     output: str = "outputs"
     experiment: ExperimentConfig | None = None
     sanity: bool = False
@@ -194,16 +183,10 @@ class EvalConfig:
     cost_cap_usd: float | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require(self.trials > 0, f"trials {self.trials} must be positive")
         require(self.steps == "task" or 1 <= self.steps <= 1000, f"steps {self.steps} outside [1, 1000]; allowed too: task")
         require(self.stuck == 0 or 4 <= self.stuck <= 1000, f"stuck {self.stuck} must be 0 or in [4, 1000]")
-        require(0 <= self.workers <= 4096, f"workers {self.workers} outside [0, 4096]")
-        require(1 <= self.batch <= 1024, f"batch {self.batch} outside [1, 1024]")
-        require(self.scheduler == "local" or self.workers > 0, f"workers {self.workers} must be positive with scheduler=ray")
-        require(
-            self.scheduler == "ray" or self.ray_address is None,
-            f"ray_address {self.ray_address!r} needs scheduler=ray, got {self.scheduler!r}",
-        )
         require(
             self.batch == 1 or self.planner.kind == "mllm" or (self.planner.kind == "file" and self.backend is None),
             f"batch {self.batch} with planner kind {self.planner.kind!r}; allowed: mllm, or file with begin and step_batch; a "
@@ -244,5 +227,4 @@ class EvalConfig:
             f"cost_cap_usd {cap} with planner kind {self.planner.kind!r}, which asks no backend; allowed: null",
         )
         require(self.limit is None or self.limit > 0, f"limit {self.limit} must be positive or null")
-        require(self.retries >= 0, f"retries {self.retries} must not be negative")
         require(self.seed >= 0, f"seed {self.seed} must not be negative")

@@ -7,6 +7,7 @@ from typing import Literal
 
 from configs.schema.checks import require
 from configs.schema.data import DataConfig
+from configs.schema.execution import Execution
 from configs.schema.model import ModelConfig
 
 #: Training tasks have 2^31 seeds, a million for each seed of a run.
@@ -121,6 +122,8 @@ class PracticeConfig:
         own_share: share of what is learnt that is from those episodes.
         logged: share that is from the teacher's own episodes in the simulator; the rest is of the text world.
         workers: processes.
+        student: with pretrained weights, the stored model that acts (what alignment or selu made); the next alignment learns
+            from its episodes too. None leaves them out.
     """
 
     loop: LoopConfig
@@ -129,6 +132,7 @@ class PracticeConfig:
     own_share: float = 0.2
     logged: float = 0.2
     workers: int = 2
+    student: str | None = None
 
     def __post_init__(self) -> None:
         _require_shares(self, "teacher_share", "own_share", "logged")
@@ -179,6 +183,7 @@ class SeluConfig:
         replay_share: share of the batches that is replayed against forgetting: for the actor decisions of lessons, for
             the critic judging questions.
         per_class: most kept trajectories per verb, robot and category.
+        rollouts: who runs them.
     """
 
     critic: LoopConfig
@@ -189,6 +194,7 @@ class SeluConfig:
     truth: Literal["audit", "oracle"] = "audit"
     replay_share: float = 0.5
     per_class: int = 40
+    rollouts: Execution = field(default_factory=Execution)
 
     def __post_init__(self) -> None:
         _require_shares(self, "replay_share")
@@ -244,6 +250,7 @@ class TrainConfig:
         micro_batches: into how many each step's batch is cut, to save memory or to be shared by processes; a multiple of these.
         recompute: whether the backbone's activations are computed again in the backward pass instead of being kept.
         shard: whether processes share the backbone's frozen layers (FSDP2); with released weights (`model.weights`) alone.
+        keep_spatial: whether what the frozen point map makes of an image is kept in the user's cache folder and computed once.
         footprint: prints what alignment costs, on GPUs that reach so many TFLOP/s each, and trains nothing; None trains.
         overwrite: run a stage from its start although its output is current, or a checkpoint is there.
         release: folder the finished stages are exported to, None for no export.
@@ -271,6 +278,7 @@ class TrainConfig:
     micro_batches: int = 1
     recompute: bool = False
     shard: bool = False
+    keep_spatial: bool = False
     footprint: float | None = None
     overwrite: bool = False
     release: str | None = None
@@ -280,6 +288,10 @@ class TrainConfig:
         require(0 <= self.seed <= LARGEST_SEED, f"seed {self.seed} outside [0, {LARGEST_SEED}]")
         require(
             self.footprint is None or self.footprint > 0.0, f"footprint {self.footprint} must be positive: TFLOP/s of a GPU"
+        )
+        require(
+            self.practice.student is None or self.model.weights is not None,
+            f"practice.student {self.practice.student!r}: the model of stage words acts, unless model.weights are given",
         )
         require(not self.shard or self.model.weights is not None, "shard=true shares a frozen backbone; set model.weights")
         require(self.micro_batches >= 1, f"micro_batches {self.micro_batches} must be at least 1")

@@ -1,4 +1,4 @@
-"""Episodes on a Ray instance (`data.cluster`): actors with a simulator each, and on request one with the model.
+"""Episodes on a Ray instance (`data.cluster`): actors with a simulator each, and on request one with the model for every GPU.
 
 An actor that dies is replaced and its episode run again; after `retries` further attempts it becomes an infrastructure error.
 
@@ -43,9 +43,15 @@ class _ModelActor:
 
     def __init__(self, planner: PlannerConfig, batch: int) -> None:
         self._desk = ModelDesk(batch_planner(planner), batch)
+        self._callers = 0
+
+    def callers(self) -> int:
+        """How many workers have connected."""
+        return self._callers
 
     def image_size(self) -> int:
-        """Side of the image that the planner wants to see."""
+        """Side of the image that the planner wants to see; asked by a worker that connects."""
+        self._callers += 1
         return self._desk.image_size
 
     def begin(self, caller: str, task: TaskInfo, rng: np.random.Generator) -> None:
@@ -58,19 +64,20 @@ class _ModelActor:
 
 
 class RayServer:
-    """The actor with the model; can be sent to workers.
+    """The actors with the model; can be sent to workers.
 
     Args:
-        actor: its handle.
+        actors: their handles.
     """
 
-    def __init__(self, actor: Any) -> None:
-        self._actor = actor
+    def __init__(self, actors: Sequence[Any]) -> None:
+        self.actors = tuple(actors)
 
     def connect(self) -> Planner:
-        """A planner that asks the actor."""
-        ray, actor = import_ray(), self._actor
+        """A planner that asks the actor with fewest callers."""
+        ray = import_ray()
         caller = str(ray.get_runtime_context().get_actor_id())
+        actor = self.actors[int(np.argmin(ray.get([one.callers.remote() for one in self.actors])))]
 
         def ask(method: str, *arguments: Any) -> Any:
             return ray.get(getattr(actor, method).remote(caller, *arguments))
@@ -79,11 +86,12 @@ class RayServer:
 
 
 def ray_model(ray: Any, planner: PlannerConfig, batch: int) -> RayServer:
-    """Starts the actor with the model, on a GPU where the instance has one; Ray starts it again when it dies."""
-    gpus = 1 if ray.cluster_resources().get("GPU", 0) >= 1 else 0
+    """Starts an actor with the model for every GPU of the cluster, or one; Ray starts it again when it dies."""
+    gpus = int(ray.cluster_resources().get("GPU", 0))
     # Twice as many threads as a batch has rows: while one batch is answered the next one gathers.
-    options = {"num_cpus": 0, "num_gpus": gpus, "max_concurrency": 2 * batch, "max_restarts": -1}
-    return RayServer(ray.remote(_ModelActor).options(**options).remote(planner, batch))
+    options = {"num_cpus": 0, "num_gpus": min(gpus, 1), "max_concurrency": 2 * batch, "max_restarts": -1}
+    kind = ray.remote(_ModelActor).options(**options)
+    return RayServer([kind.remote(planner, batch) for _ in range(max(gpus, 1))])
 
 
 def run_ray_jobs(

@@ -7,10 +7,9 @@ Tasks come from the sampler's training split, so no benchmark task is explored; 
 
 from __future__ import annotations
 
-import functools
+import contextlib
 import logging
-import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 from tqdm import tqdm
@@ -20,9 +19,9 @@ from configs.schema.robot import RobotConfig
 from data.shards import ShardWriter
 from interface.bodies import PAPER_ROBOTS
 from proprio_mllm.evaluation.episode import EpisodeKeyFields
-from proprio_mllm.evaluation.pool import run_jobs
+from proprio_mllm.evaluation.scheduling import scheduled
 from proprio_mllm.evaluation.seeds import episode_seed
-from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, EpisodeWorker, Opener, WorkerSetup, lost_episode
+from proprio_mllm.evaluation.worker import EpisodeJob, EpisodeResult, Opener, WorkerSetup
 from proprio_mllm.training.rollouts import RolloutRequest
 from sim.tasks.task import Task
 
@@ -47,7 +46,6 @@ def collect_rollouts(
     tasks: Sequence[Task] | None = None,
     robots: Sequence[str] = PAPER_ROBOTS,
     difficulty: DifficultyName = "natural",
-    workers: int = 2,
     opener: Opener | None = None,
 ) -> None:
     """Runs the actor and writes a complete `rollouts` folder; an interrupted one is continued part by part.
@@ -57,7 +55,6 @@ def collect_rollouts(
         tasks: training tasks, in turn; drawn from the request's seed by default.
         robots: robots, in turn.
         difficulty: success of low-level skills.
-        workers: processes; 0 runs here.
         opener: opens sessions; the simulator's by default.
 
     Raises:
@@ -77,27 +74,21 @@ def collect_rollouts(
         parts = {i: jobs[i * _PER_PART : (i + 1) * _PER_PART] for i in missing}
         planner = PlannerConfig("actor", "mllm", "Actor", str(request.model), temperature=request.temperature)
         setup = WorkerSetup(planner, difficulty, "fixed", steps="task")
-        make = functools.partial(EpisodeWorker, setup) if opener is None else functools.partial(EpisodeWorker, setup, opener)
-        _run_parts(writer, parts, make, min(workers, os.cpu_count() or 1), len(jobs))
+        queue = [job for part in parts.values() for job in part]
+        with contextlib.closing(scheduled(request.execution, setup, queue, _never, opener)) as results:
+            _write_parts(writer, parts, results, len(jobs))
     if not writer.manifest.complete:
         broken = request.episodes - sum(part.rows for part in writer.manifest.parts.values())
         writer.finish({"actor": str(request.model), "temperature": request.temperature, "infrastructure_errors": broken})
 
 
-def _run_parts(
-    writer: ShardWriter,
-    parts: dict[int, list[EpisodeJob]],
-    make: functools.partial[EpisodeWorker],
-    workers: int,
-    total: int,
-) -> None:
+def _write_parts(writer: ShardWriter, parts: dict[int, list[EpisodeJob]], results: Iterable[EpisodeResult], total: int) -> None:
     """Writes every part as soon as its last episode ends; episodes that broke are left out."""
     owner = {_name(job.fields): index for index, jobs in parts.items() for job in jobs}
     left = {index: len(jobs) for index, jobs in parts.items()}
     rows: dict[int, list[dict[str, Any]]] = {index: [] for index in parts}
-    queue = [job for jobs in parts.values() for job in jobs]
-    with tqdm(total=total, initial=total - len(queue), desc="rollouts", unit="episode") as bar:
-        for result in run_jobs(make, queue, workers, _never, lost_episode):
+    with tqdm(total=total, initial=total - sum(left.values()), desc="rollouts", unit="episode") as bar:
+        for result in results:
             bar.update(1)
             record = result.record
             index = owner[record.task, record.robot, record.trial]

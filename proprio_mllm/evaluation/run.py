@@ -368,7 +368,7 @@ def _run_missing(
     title = f"{cfg.planner.name} {cfg.robot.name} {cfg.difficulty}"
     with (
         tqdm(total=len(jobs), initial=len(known), desc=title, unit="episode", disable=not told) as bar,
-        contextlib.closing(scheduled(cfg, setup, order, _to_repeat, opener)) as results,
+        contextlib.closing(scheduled(cfg, setup, order, _to_repeat, opener, cfg.threads)) as results,
     ):
         for result in results:
             if result.stop:

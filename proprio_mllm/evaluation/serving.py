@@ -1,8 +1,8 @@
-"""One process that holds the model, for all worker processes of this machine.
+"""Processes that hold the model, one for every GPU or one in all, for all worker processes of this machine.
 
-Workers connect through a Unix socket with a random key; each connection is a caller of the `ModelDesk`, which answers up to
-`batch` of them at once. When the process dies, the calls under way become infrastructure errors, it is started anew, and the
-workers connect again at their next episode.
+Workers connect through a Unix socket with a random key, each to the process that has fewest callers; each connection is a
+caller of that process's `ModelDesk`, which answers up to `batch` of them at once. When a process dies, the calls under way
+become infrastructure errors, it is started anew, and its workers connect again at their next episode.
 
 Paper: none (engineering).
 """
@@ -18,7 +18,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Client, Connection, Listener
@@ -68,6 +68,12 @@ class _Connected:
             raise RuntimeError(f"the model's process could not answer: {value}")
         return value
 
+    def close(self) -> None:
+        """Goes away."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
 
 @dataclass(frozen=True, slots=True)
 class SocketServer:
@@ -81,10 +87,20 @@ class SocketServer:
     path: str
     key: bytes
 
+
+@dataclass(frozen=True, slots=True)
+class SocketServers:
+    """Several of them."""
+
+    servers: tuple[SocketServer, ...]
+
     def connect(self) -> Planner:
-        """A planner that asks the process; waits until it listens."""
-        connected = _Connected(self)
-        return AskingPlanner(connected.ask("image_size"), connected.ask)
+        """A planner that asks the process with fewest callers; waits until all listen."""
+        connected = [_Connected(server) for server in self.servers]
+        taken = connected.pop(int(np.argmin([one.ask("callers") for one in connected])))
+        for other in connected:
+            other.close()
+        return AskingPlanner(taken.ask("image_size"), taken.ask)
 
 
 def _connected(server: SocketServer) -> Connection[Any, Any]:
@@ -98,23 +114,25 @@ def _connected(server: SocketServer) -> Connection[Any, Any]:
             time.sleep(_POLL_S)
 
 
-def _serve(planner: PlannerConfig, batch: int, server: SocketServer) -> None:
+def _serve(planner: PlannerConfig, batch: int, server: SocketServer, gpu: str | None) -> None:
     start_worker()
+    if gpu is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpu  # before anything of CUDA starts here
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # ends tidily, so that nothing of it is left to clean up
     desk = ModelDesk(batch_planner(planner), batch)
     with contextlib.suppress(FileNotFoundError):
         os.unlink(server.path)  # of a process that died
     with Listener(server.path, "AF_UNIX", backlog=4096, authkey=server.key) as listener:
-        number = 0
+        number, callers = 0, set[str]()
         while True:
             with contextlib.suppress(OSError, EOFError):  # a caller that went away while it connected
                 connection = listener.accept()
                 number += 1
-                threading.Thread(target=_answer, args=(desk, connection, str(number)), daemon=True).start()
+                threading.Thread(target=_answer, args=(desk, connection, str(number), callers), daemon=True).start()
 
 
-def _answer(desk: ModelDesk, connection: Connection[Any, Any], caller: str) -> None:
-    """Answers one caller until it goes away."""
+def _answer(desk: ModelDesk, connection: Connection[Any, Any], caller: str, callers: set[str]) -> None:
+    """Answers one caller until it goes away; those who only ask how many callers there are count as none."""
 
     def begin(task: TaskInfo, rng: np.random.Generator) -> None:
         desk.begin(caller, task, rng)
@@ -122,15 +140,22 @@ def _answer(desk: ModelDesk, connection: Connection[Any, Any], caller: str) -> N
     def step(observation: Observation) -> PlannerReply:
         return desk.step(caller, observation)
 
-    methods = {"begin": begin, "step": step, "image_size": lambda: desk.image_size}
+    def image_size() -> int:
+        callers.add(caller)
+        return desk.image_size
+
+    methods = {"begin": begin, "step": step, "image_size": image_size, "callers": lambda: len(callers)}
     with connection, contextlib.suppress(OSError, EOFError):
-        while True:
-            method, arguments = connection.recv()
-            try:
-                answer = True, methods[method](*arguments)
-            except Exception as error:  # noqa: BLE001  # sent to the episode that it belongs to, which records it
-                answer = False, f"{type(error).__name__}: {error}"
-            connection.send(answer)
+        try:
+            while True:
+                method, arguments = connection.recv()
+                try:
+                    answer = True, methods[method](*arguments)
+                except Exception as error:  # noqa: BLE001  # sent to the episode that it belongs to, which records it
+                    answer = False, f"{type(error).__name__}: {error}"
+                connection.send(answer)
+        finally:
+            callers.discard(caller)
 
 
 class ModelProcess:
@@ -140,11 +165,12 @@ class ModelProcess:
         planner: who answers.
         batch: most calls answered together.
         folder: for the socket.
+        gpu: the only one it sees, as `CUDA_VISIBLE_DEVICES` names it; None leaves that as it is.
     """
 
-    def __init__(self, planner: PlannerConfig, batch: int, folder: Path) -> None:
-        self.server = SocketServer(str(folder / "model"), os.urandom(32))
-        self._arguments = (planner, batch, self.server)
+    def __init__(self, planner: PlannerConfig, batch: int, folder: Path, gpu: str | None = None) -> None:
+        self.server = SocketServer(str(folder / f"model_{gpu}"), os.urandom(32))
+        self._arguments = (planner, batch, self.server, gpu)
         self._context = get_context("spawn")
         self.process = self._started()
 
@@ -167,15 +193,45 @@ class ModelProcess:
         self.process.join()
 
 
+class ModelProcesses:
+    """One for every GPU, or one in all.
+
+    Args:
+        planner: who answers.
+        batch: most calls answered together by each.
+        folder: for the sockets.
+        gpus: names of the GPUs; none starts one process, where it likes.
+    """
+
+    def __init__(self, planner: PlannerConfig, batch: int, folder: Path, gpus: Sequence[str]) -> None:
+        self.processes = tuple(ModelProcess(planner, batch, folder, gpu) for gpu in gpus or (None,))
+        self.server = SocketServers(tuple(one.server for one in self.processes))
+
+    def ensure(self) -> None:
+        """Starts those anew that are gone."""
+        for one in self.processes:
+            one.ensure()
+
+
+def visible_gpus() -> tuple[str, ...]:
+    """GPUs of this machine that this process may use, as `CUDA_VISIBLE_DEVICES` names them."""
+    import torch
+
+    listed = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    count = torch.cuda.device_count()
+    return tuple(listed.split(",")[:count]) if listed else tuple(map(str, range(count)))
+
+
 @contextlib.contextmanager
-def model_process(planner: PlannerConfig, batch: int) -> Iterator[ModelProcess]:
-    """A model's process for the time of the block."""
+def model_processes(planner: PlannerConfig, batch: int, gpus: Sequence[str] | None = None) -> Iterator[ModelProcesses]:
+    """The model's processes for the time of the block; `gpus` are those that are visible unless told."""
     folder = Path(tempfile.mkdtemp(prefix="proprio-"))
     try:
-        model = ModelProcess(planner, batch, folder)
+        model = ModelProcesses(planner, batch, folder, visible_gpus() if gpus is None else gpus)
         try:
             yield model
         finally:
-            model.stop()
+            for one in model.processes:
+                one.stop()
     finally:
         shutil.rmtree(folder, ignore_errors=True)

@@ -79,9 +79,8 @@ class CrossSpatialEncoder(nn.Module):
             parts.append(cells.permute(0, 2, 4, 1, 3, 5).reshape(len(cells), h * w, 16))
         return torch.cat(parts, dim=-1)
 
-    def forward(self, features: Tensor, geo: GeoFeatures, h: int, w: int, camera_in_pelvis: Tensor | None = None) -> Tensor:
-        """T (I, N, D) from F2D (I, N, D)."""
+    def forward(self, features: Tensor, spatial: Tensor) -> Tensor:
+        """T (I, N, D) from F2D (I, N, D) and what `spatial` gives."""
         own = self.phi.weight.dtype  # stays in float32 under a backbone in half precision
-        spatial = self.spatial(geo, h, w, camera_in_pelvis).to(own)
-        out = self.mlp(features.to(own) + self.phi(spatial)).to(features.dtype)
+        out = self.mlp(features.to(own) + self.phi(spatial.to(own))).to(features.dtype)
         return out if self.cfg.literal else features + out

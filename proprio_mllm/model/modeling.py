@@ -25,6 +25,7 @@ from proprio_mllm.model.batch import IGNORE, Batch, ImageBatch
 from proprio_mllm.model.cse import CrossSpatialEncoder
 from proprio_mllm.model.mpe import SignEmbedding
 from proprio_mllm.model.processor import ProprioProcessor
+from proprio_mllm.model.spatial_cache import SpatialCache
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +77,8 @@ class ProprioMLLM(nn.Module):
         hidden = self.hidden_size
         self.point_map = point_map if cfg.cse.enabled else None
         self.cse: CrossSpatialEncoder | None = None
+        #: Where training keeps what the frozen point map makes of an image.
+        self.seen: SpatialCache | None = None
         if cfg.cse.enabled:
             if point_map is None:
                 raise ValueError("cse.enabled needs a point map, got None")
@@ -125,13 +128,23 @@ class ProprioMLLM(nn.Module):
         """Visual tokens (I, N, D) after CSE and the additive MPE."""
         h, w = images.grid
         if self.cse is not None:
-            assert self.point_map is not None
-            with torch.no_grad():
-                geo = self.point_map(images.rgb, images.points_m)
-            visual = self.cse(visual, geo, h, w, images.camera_in_pelvis)
+            visual = self.cse(visual, self.spatial(images))
         if self.mpe is not None:
             visual = visual + torch.stack([self.mpe(h, w, place) for place in images.centroids]).to(visual.dtype)
         return visual
+
+    def keep_spatial(self) -> None:
+        """From now on, what the point map makes of an image is kept (`spatial_cache`)."""
+        if self.cse is not None and self.point_map is not None:
+            self.seen = SpatialCache(self.point_map, self.cse)
+
+    @torch.no_grad()
+    def spatial(self, images: ImageBatch) -> Tensor:
+        """F3D on the merged grid (`CrossSpatialEncoder.spatial`), read from `self.seen` where that is."""
+        assert self.cse is not None and self.point_map is not None
+        if self.seen is None:
+            return self.cse.spatial(self.point_map(images.rgb, images.points_m), *images.grid, images.camera_in_pelvis)
+        return self.seen.spatial(self.cse, self.point_map, images)
 
     def _inputs(self, batch: Batch) -> tuple[dict[str, Any], Tensor | None]:
         inputs: dict[str, Any] = {

@@ -215,6 +215,8 @@ def run_loop(
                 last = {name: total / sums[f"#{name}"] for name, total in sums.items() if not name.startswith("#")}
                 last["lr"] = learning_rate(cfg, step, seconds)
                 last["examples_per_s"] = counted * cfg.batch / max(time.monotonic() - began, 1e-9)
+                if device.type == "cuda":
+                    last["gpu_gb"] = torch.cuda.max_memory_allocated(device) / 1e9
                 if writer is not None:
                     writer.write(done, last)
                 bar.set_postfix(loss=f"{last['loss']:.3f}", refresh=False)

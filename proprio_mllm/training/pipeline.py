@@ -174,6 +174,7 @@ class Pipeline:
         inputs |= {kind: shard_hash(self.paths.shards(kind)) for kind in stage.shards}
         settings = dict(stage.settings(self)) | ({"recipe": stage.recipe} if stage.recipe else {})
         settings |= {"micro_batches": self.cfg.micro_batches} if self.cfg.micro_batches > 1 else {}
+        settings |= {"keep_spatial": True} if self.cfg.keep_spatial else {}
         return stage_key(settings, self.cfg.seed, inputs)
 
     def ancestors(self, name: str) -> tuple[str, ...]:
@@ -230,6 +231,8 @@ class Pipeline:
         """Runs one objective with this configuration's seed and logger."""
         first_alone(lambda: folder.mkdir(parents=True, exist_ok=True))
         spare_memory(objective.module, self.cfg.recompute, self.cfg.shard)
+        if self.cfg.keep_spatial and isinstance(objective.module, ProprioMLLM):
+            objective.module.keep_spatial()
         about = {"key": objective.key}
         writer = MetricWriter(folder, objective.name, self.cfg.logger, about) if processes().is_main_process else None
         resume = self.cfg.resume and not self.cfg.overwrite

@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from configs.schema.execution import Execution
 from data.motion import KEY_BODY_COUNT
 from data.shards import ShardReader, decode_motion, decode_png, encode_png
 from interface.observation import Camera, HistoryItem, Observation
@@ -37,6 +38,7 @@ class RolloutRequest:
         seed: of the sampled tasks, the world and the actor's draws.
         temperature: of the actor.
         config_hash: hash to store in the shard's manifest.
+        execution: who runs them.
     """
 
     model: Path
@@ -45,6 +47,7 @@ class RolloutRequest:
     seed: int
     temperature: float
     config_hash: str
+    execution: Execution = field(default_factory=Execution)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 
+from configs.schema.execution import Execution
 from data.shards import Manifest
 from proprio_mllm.evaluation import worker as worker_module
 from proprio_mllm.evaluation.rollouts import collect_rollouts
@@ -16,12 +17,12 @@ from proprio_mllm.training.rollouts import RolloutRequest, read_rollouts
 def request_(tmp_path, monkeypatch, scripted) -> RolloutRequest:
     planner = scripted("GoTo(Mug_1)", "nonsense", "MoveDown(0.2)", "Pick(left, Mug_1)")
     monkeypatch.setattr(worker_module, "make_planner", lambda cfg: planner)
-    return RolloutRequest(tmp_path / "actor", tmp_path / "rollouts", 5, 3, 0.7, "hash")
+    return RolloutRequest(tmp_path / "actor", tmp_path / "rollouts", 5, 3, 0.7, "hash", Execution(workers=0))
 
 
 def test_rows_read_back(request_, session, task) -> None:
     tasks = [task("a", split="train"), task("b", split="train")]
-    collect_rollouts(request_, tasks, workers=0, opener=lambda setup, job, planner: session(job.robot.name))
+    collect_rollouts(request_, tasks, opener=lambda setup, job, planner: session(job.robot.name))
     rollouts = read_rollouts(request_.folder)
     assert len(rollouts) == 5
     assert {rollout.robot for rollout in rollouts} == {"h1", "x1"}
@@ -43,21 +44,21 @@ def test_a_broken_episode_is_left_out_and_a_complete_folder_is_kept(request_, se
         return session(job.robot.name, broken=1 if len(calls) == 2 else None)
 
     tasks = [task("a", split="train")]
-    collect_rollouts(request_, tasks, workers=0, opener=opener)
+    collect_rollouts(request_, tasks, opener=opener)
     assert len(read_rollouts(request_.folder)) == 4
-    collect_rollouts(request_, tasks, workers=0, opener=opener)
+    collect_rollouts(request_, tasks, opener=opener)
     assert len(calls) == 5
     manifest = Manifest.load(request_.folder)
     assert manifest.metadata["infrastructure_errors"] == 1
     dataclasses.replace(manifest, complete=False).save(request_.folder)  # killed after the last part
-    collect_rollouts(request_, tasks, workers=0, opener=opener)
+    collect_rollouts(request_, tasks, opener=opener)
     assert len(calls) == 5
     assert Manifest.load(request_.folder) == manifest
 
 
 def test_refuses_benchmark_tasks_and_zero_temperature(request_, task) -> None:
     with pytest.raises(ValueError, match="training tasks only, got 'bench'"):
-        collect_rollouts(request_, [task("bench")], workers=0)
-    cold = RolloutRequest(request_.model, request_.folder, 1, 0, 0.0, "x")
+        collect_rollouts(request_, [task("bench")])
+    cold = RolloutRequest(request_.model, request_.folder, 1, 0, 0.0, "x", Execution(workers=0))
     with pytest.raises(ValueError, match=r"temperature 0\.0"):
-        collect_rollouts(cold, [], workers=0)
+        collect_rollouts(cold, [])

@@ -21,7 +21,7 @@ from interface.episode import EpisodeRecord
 from interface.observation import Camera, Observation, Proprioception
 from proprio_mllm.evaluation.ray_pool import ray_model, run_ray_jobs
 from proprio_mllm.evaluation.run import evaluate
-from proprio_mllm.evaluation.serving import model_process
+from proprio_mllm.evaluation.serving import model_processes, visible_gpus
 from proprio_mllm.planners.protocol import Planner, TaskInfo
 from sim.tasks.task import load_benchmark, write_tasks
 
@@ -158,8 +158,9 @@ def said(planner: Planner, seed: int) -> list[str]:
 
 
 def test_a_models_process_answers_callers_apart_and_is_started_again(own: PlannerConfig) -> None:
-    with model_process(own, 2) as model:
-        one, other = model.server.connect(), model.server.connect()
+    with model_processes(own, 2, ()) as models:
+        (model,) = models.processes
+        one, other = models.server.connect(), models.server.connect()
         assert one.image_size == 56
         assert said(one, 1) == said(other, 1) != said(one, 2)
         with pytest.raises(RuntimeError, match="ValueError: no answer to this"):
@@ -169,13 +170,42 @@ def test_a_models_process_answers_callers_apart_and_is_started_again(own: Planne
         model.process.join(10)
         model.ensure()
         before = said(one, 1)
-        assert before == said(model.server.connect(), 1)
+        assert before == said(models.server.connect(), 1)
         with pytest.raises((EOFError, OSError)):
             other.step(observation("turn"), None)
         with pytest.raises(RuntimeError, match="has begun no episode here"):
             other.step(observation("turn"), None)  # connected again, but its episode is gone
         assert said(other, 1) == before
     assert not Path(model.server.path).exists()
+
+
+def test_callers_are_spread_over_the_gpus(own: PlannerConfig) -> None:
+    with model_processes(own, 2, ("0", "1")) as models:
+        callers = [models.server.connect() for _ in range(4)]
+        assert len({tuple(said(one, 1)) for one in callers}) == 1
+        first, second = models.processes
+        with pytest.raises((EOFError, ConnectionResetError)):
+            callers[0].step(observation("die"), None)  # the others of its process are two
+        died = [one for one in models.processes if not (one.process.join(3) or one.process.is_alive())]
+        assert len(died) == 1
+        broken = 0
+        for one in callers[1:]:
+            try:
+                one.step(observation("turn"), None)
+            except (EOFError, OSError):
+                broken += 1
+        assert broken == 1
+        models.ensure()
+        assert first.process.is_alive() and second.process.is_alive()
+        assert len({tuple(said(one, 1)) for one in callers}) == 1
+
+
+def test_gpus_are_those_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    assert visible_gpus() == ("3", "5")
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    assert visible_gpus() == ("0", "1")
 
 
 @pytest.mark.slow

@@ -7,11 +7,13 @@ import pytest
 import torch
 
 from configs.schema.model import CseConfig, PointMapConfig
-from proprio_mllm.model.batch import Collator
-from proprio_mllm.model.building import build_model, build_point_map
+from proprio_mllm.model.batch import Collator, Example
+from proprio_mllm.model.building import build_model, build_point_map, build_processor
 from proprio_mllm.model.cse import CrossSpatialEncoder
 from proprio_mllm.model.dense import DenseHead, dense_targets
 from proprio_mllm.model.point_map import GeoFeatures, OraclePointMap, SimPointMap, point_map_loss
+from proprio_mllm.model.prompts import looking
+from tests.model.conftest import TEXTS, TYPES, make_view, small
 
 
 def _geo(points: torch.Tensor, channels: int = 0) -> GeoFeatures:
@@ -52,10 +54,39 @@ def test_missing_points_do_not_pull_the_mean():
 def test_residual_starts_as_identity_and_literal_is_the_equation(source):
     geo, features = _geo(torch.randn(2, 8, 8, 3), channels=5), torch.randn(2, 16, 8)
     residual = CrossSpatialEncoder(CseConfig(source=source, frame="camera"), 8, 5)
-    assert torch.equal(residual(features, geo, 4, 4), features)
+    assert torch.equal(residual(features, residual.spatial(geo, 4, 4, None)), features)
     literal = CrossSpatialEncoder(CseConfig(source=source, frame="camera", literal=True), 8, 5)
-    expected = literal.mlp(features + literal.phi(literal.spatial(geo, 4, 4, None)))
-    assert torch.equal(literal(features, geo, 4, 4), expected)
+    spatial = literal.spatial(geo, 4, 4, None)
+    assert torch.equal(literal(features, spatial), literal.mlp(features + literal.phi(spatial)))
+
+
+def test_what_the_point_map_makes_of_an_image_is_computed_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    cfg = small()
+    model = build_model(cfg, build_processor(cfg, TEXTS, TYPES)).eval()
+    rng = np.random.default_rng(0)
+    views = [make_view(rng) for _ in range(3)]
+    images = Collator(model.processor, cfg)([Example(tuple(looking([("a", "b")], None, "terse")), (v,)) for v in views]).images
+    plain, seen = model.spatial(images), list[int]()
+    model.point_map.register_forward_pre_hook(lambda module, inputs: seen.append(len(inputs[0])))
+    model.keep_spatial()
+    first = model.spatial(part(images, [0, 2]))
+    torch.testing.assert_close(first.float(), plain[[0, 2]], atol=2e-3, rtol=2e-3)
+    again = model.spatial(images)  # one of them is new
+    assert torch.equal(again[[0, 2]], first) and seen == [2, 1]
+    model.keep_spatial()  # another process
+    assert torch.equal(model.spatial(images), again) and seen == [2, 1]
+    turned = dataclasses.replace(images, camera_in_pelvis=images.camera_in_pelvis + 0.1)
+    assert not torch.equal(model.spatial(turned), again) and seen == [2, 1, 3]
+    with torch.no_grad():
+        next(model.point_map.parameters()).add_(0.1)
+    model.keep_spatial()
+    assert not torch.equal(model.spatial(images), again) and seen == [2, 1, 3, 3]
+
+
+def part(images, rows):
+    pick = torch.tensor(rows)
+    return dataclasses.replace(images, rgb=images.rgb[pick], camera_in_pelvis=images.camera_in_pelvis[pick])
 
 
 def test_tokens_need_an_encoder_with_tokens():

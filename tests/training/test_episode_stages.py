@@ -20,7 +20,7 @@ from proprio_mllm.training.pipeline import Pipeline, base_model_config
 from proprio_mllm.training.rollouts import read_rollouts
 from proprio_mllm.training.stages import STAGES
 from proprio_mllm.training.stages.inputs import episodes_in_words, lesson_folders, lessons_of, turns_of
-from tests.training.conftest import collect
+from tests.training.conftest import collect, correct
 
 
 def test_every_stage_reads_the_one_before(trained: Pipeline) -> None:
@@ -83,6 +83,14 @@ def test_pretrained_weights_read_episodes_as_english(trained: Pipeline, tmp_path
     assert example.tokens is not None
     text = made.processor.tokenizer.decode(example.tokens.ids)
     assert re.search(r"\nNow: left empty right empty .*<\|image_pad\|>.*<motion_end>\nDo: \w+ [\w ]+\nDo: \w+", text)
+
+    assert lesson_folders(pipeline) == [pipeline.paths.shards("lessons")]
+    student = dataclasses.replace(given.practice, student=str(pipeline.paths.model("selu")))
+    acted = Pipeline(STAGES, dataclasses.replace(given, practice=student), collect, "", correct, Lessons())
+    assert (acted.run("practice") or {})["own_as_teacher"] == 0.5
+    assert not acted.paths.model("practice").exists()  # it acts, and learns in the next alignment
+    assert lesson_folders(acted) == [acted.paths.shards("lessons"), acted.paths.shards("practice")]
+    assert not acted.is_current("alignment")
 
 
 def test_hindsight_names_the_sub_goal(trained: Pipeline) -> None:

@@ -14,8 +14,9 @@ from proprio_mllm.training.words import WordsObjective, mixed
 
 
 def lesson_folders(pipeline: Pipeline) -> list[Path]:
-    """Shards of episodes in the simulator: the teacher's, and those in which the words model acted where there is one."""
-    names = ("lessons", "practice") if pipeline.cfg.model.weights is None else ("lessons",)
+    """Shards of episodes in the simulator: the teacher's, and those in which a model acted where one did."""
+    acted = pipeline.cfg.model.weights is None or pipeline.cfg.practice.student is not None
+    names = ("lessons", "practice") if acted else ("lessons",)
     return [pipeline.paths.shards(name) for name in names]
 
 

@@ -1,4 +1,8 @@
-"""Stage `practice`: DAgger in the simulator. The words model acts, its teacher answers, and it learns from both worlds."""
+"""Stage `practice`: DAgger in the simulator. The words model acts, its teacher answers, and it learns from both worlds.
+
+With pretrained weights a model that has been aligned may act (`practice.student`): it leaves episodes that the next alignment
+learns from.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from data.files import read_json
 from data.shards import ShardReader, config_hash
 from proprio_mllm.model.building import load_model
 from proprio_mllm.training.pipeline import Metrics, Pipeline, StageError
@@ -28,41 +33,29 @@ class PracticeStage:
     recipe = 0
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
-        """The loop, and how much the model acts."""
-        return {"practice": dataclasses.asdict(pipeline.cfg.practice)}
+        """The loop, how much the model acts, and who acts where it is not the words model."""
+        cfg = pipeline.cfg.practice
+        settings: dict[str, Any] = dataclasses.asdict(cfg)
+        if settings.pop("student") is not None:
+            settings["student"] = read_json(Path(str(cfg.student)) / "config.json")
+        return {"practice": settings}
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
         """Lets the model act, trains it and stores it; measures it on episodes that it was not trained on.
 
-        Pretrained weights need none of it.
+        Pretrained weights need none of it; a student of theirs acts, and that is all.
         """
-        if pipeline.needs_no(self.name):
+        cfg, shards = pipeline.cfg.practice, pipeline.paths.shards("practice")
+        given = pipeline.cfg.model.weights is not None
+        if given and cfg.student is None:
+            pipeline.needs_no(self.name)
             return {}
-        lessons, cfg, student = pipeline.lessons, pipeline.cfg.practice, pipeline.paths.model("words")
-        if pipeline.collect_dagger is None:
-            raise StageError("stage 'practice' needs the simulator: run it with `python train.py stage=practice`")
-        shards = pipeline.paths.shards("practice")
-        ahead = pipeline.cfg.collect.foreseen
-        decides = {"key": pipeline.key("words"), "episodes": cfg.episodes, "share": cfg.teacher_share}
-        written = config_hash(decides | ({"foreseen": True} if ahead else {}))
-        request = DaggerRequest(
-            student,
-            shards,
-            cfg.episodes,
-            pipeline.cfg.seed,
-            cfg.teacher_share,
-            pipeline.cfg.model.image_size,
-            written,
-            ahead,
-        )
-        collect = pipeline.collect_dagger
-
-        def act() -> None:
-            if pipeline.cfg.overwrite:
-                shutil.rmtree(shards, ignore_errors=True)
-            collect(request, workers=cfg.workers)
-
-        first_alone(act)
+        student = pipeline.paths.model("words") if cfg.student is None else Path(cfg.student)
+        _collect(pipeline, student, shards)
+        metrics = _as_teacher(shards)
+        if given:
+            return metrics
+        lessons = pipeline.lessons
         taught, own = lessons.logged(pipeline.paths.shards("lessons")), lessons.logged(shards)
         episode = mixed(lessons.episode, (cfg.own_share, own), (cfg.logged, taught))
         model = load_model(student)
@@ -70,12 +63,32 @@ class PracticeStage:
         model.core.model.language_model.requires_grad_(True)
         pipeline.loop(WordsObjective(model, episode, key, pipeline.cfg.words.reading), cfg.loop, folder / "loop")
         pipeline.store("practice", model)
-        reader = ShardReader(shards, "demos")
-        notes = [json.loads(text) for text in reader.column("privileged")]
-        told = zip(notes, reader.column("target"), strict=True)  # shards from before there was foresight lack `taught`
-        mine = [note["executed"] == note.get("taught", target) for note, target in told if note["origin"] == "student"]
-        return {
-            **held_out_metrics(model, {"": lessons.episode, "_logged": taught, "_own": own}),
-            "own_steps": float(len(mine)),
-            "own_as_teacher": float(np.mean(mine)) if mine else 0.0,
-        }
+        return {**held_out_metrics(model, {"": lessons.episode, "_logged": taught, "_own": own}), **metrics}
+
+
+def _collect(pipeline: Pipeline, student: Path, shards: Path) -> None:
+    """Lets a model act on training tasks."""
+    if pipeline.collect_dagger is None:
+        raise StageError("stage 'practice' needs the simulator: run it with `python train.py stage=practice`")
+    cfg, ahead, collect = pipeline.cfg.practice, pipeline.cfg.collect.foreseen, pipeline.collect_dagger
+    acts = pipeline.key("words") if cfg.student is None else read_json(student / "config.json")
+    decides = {"key": acts, "episodes": cfg.episodes, "share": cfg.teacher_share}
+    written = config_hash(decides | ({"foreseen": True} if ahead else {}))
+    size = pipeline.cfg.model.image_size
+    request = DaggerRequest(student, shards, cfg.episodes, pipeline.cfg.seed, cfg.teacher_share, size, written, ahead)
+
+    def act() -> None:
+        if pipeline.cfg.overwrite:
+            shutil.rmtree(shards, ignore_errors=True)
+        collect(request, workers=cfg.workers)
+
+    first_alone(act)
+
+
+def _as_teacher(shards: Path) -> Metrics:
+    """How many steps the student took itself, and the share of them that were the teacher's."""
+    reader = ShardReader(shards, "demos")
+    notes = [json.loads(text) for text in reader.column("privileged")]
+    told = zip(notes, reader.column("target"), strict=True)  # shards from before there was foresight lack `taught`
+    mine = [note["executed"] == note.get("taught", target) for note, target in told if note["origin"] == "student"]
+    return {"own_steps": float(len(mine)), "own_as_teacher": float(np.mean(mine)) if mine else 0.0}

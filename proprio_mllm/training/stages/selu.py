@@ -44,7 +44,7 @@ from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.pipeline import Metrics, Pipeline
-from proprio_mllm.training.processes import first_alone
+from proprio_mllm.training.processes import first_alone, processes
 from proprio_mllm.training.rollouts import Rollout, RolloutCollector, RolloutRequest, read_rollouts
 from proprio_mllm.training.stages.inputs import lessons_of, turns_of
 
@@ -132,38 +132,57 @@ def _trajectories(rollouts: Sequence[Rollout], tokenizer: MotionTokenizer | None
     return found
 
 
-class _Selu:
-    """State of one run of the stage."""
+class _Learner:
+    """The model with both adapters, on the device that trains, and what it reads.
 
-    def __init__(self, pipeline: Pipeline, folder: Path, key: str, collect: RolloutCollector) -> None:
-        self.pipeline, self.cfg, self.folder, self.key, self.collect = pipeline, pipeline.cfg.selu, folder, key, collect
-        self.start = pipeline.paths.model("alignment")
+    Args:
+        pipeline: gives the loops and the lessons.
+        folder: of the stored model; the critic is made where it is missing.
+        key: of this stage's output.
+    """
 
-    def load(self, folder: Path) -> None:
-        """Loads a model with both adapters; the critic is made when it is missing."""
+    def __init__(self, pipeline: Pipeline, folder: Path, key: str) -> None:
+        self._pipeline, self._key = pipeline, key
         self.model = load_model(folder, trainable=True)
         self.tokenizer = MotionTokenizer.load(folder / "motion") if self.model.cfg.proprioception else None
         peft: Any = self.model.vlm
         if CRITIC not in peft.peft_config:
             add_adapter(self.model, CRITIC)
             copy_adapter(self.model, ACTOR, CRITIC)
-        self.collator = Collator(self.model.processor, self.model.cfg)
-        self.demos = lessons_of(self.pipeline, self.model.cfg)
-        self.turns = turns_of(self.pipeline, self.model, self.demos, self.tokenizer)
+        self.model.to(processes().device)
+        self._demos = lessons_of(pipeline, self.model.cfg)
+        self._turns = turns_of(pipeline, self.model, self._demos, self.tokenizer)
+
+    def judge(self) -> Judge:
+        """The critic."""
+        return ModelJudge(self.model, Collator(self.model.processor, self.model.cfg), CRITIC)
 
     def _judging(self, rng: np.random.Generator) -> Example:
-        return judge_example(self.demos, int(self.demos.draw(rng, 1)[0]), rng, self.turns.codes)
+        return judge_example(self._demos, int(self._demos.draw(rng, 1)[0]), rng, self._turns.codes)
 
     def _planning(self, rng: np.random.Generator) -> Example:
-        return self.turns.draw(rng, 1)[0]
+        return self._turns.draw(rng, 1)[0]
 
     def tune(self, adapter: str, name: str, examples: Sequence[Example], loop: LoopConfig, share: float, folder: Path) -> None:
         """Fine-tunes one adapter."""
         train_adapter(self.model, adapter)
         replay = self._judging if adapter == CRITIC else self._planning
-        key = config_hash({"key": self.key, "name": name, "examples": len(examples)})
+        key = config_hash({"key": self._key, "name": name, "examples": len(examples)})
         objective = ExampleObjective(name, self.model, examples, replay, share, key)
-        self.pipeline.loop(objective, loop, folder)
+        self._pipeline.loop(objective, loop, folder)
+
+    def store(self, folder: Path) -> None:
+        """Writes the model, the actor active."""
+        use_adapter(self.model, ACTOR)
+        first_alone(lambda: save_model(self.model.eval(), folder, self.tokenizer))
+
+
+class _Selu:
+    """One run of the stage."""
+
+    def __init__(self, pipeline: Pipeline, folder: Path, key: str, collect: RolloutCollector) -> None:
+        self.pipeline, self.cfg, self.folder, self.key, self.collect = pipeline, pipeline.cfg.selu, folder, key, collect
+        self.start = pipeline.paths.model("alignment")
 
     def round(self, number: int) -> dict[str, float]:
         """One round; its folder holds rollouts, the two runs, the model and its metrics."""
@@ -173,9 +192,8 @@ class _Selu:
             return read_json(folder / "done.json")["metrics"]
         before = self.start if number == 0 else self.folder / f"round_{number - 1}" / "model"
         seed = self.pipeline.cfg.seed * 1000 + number
-        request = RolloutRequest(
-            before, folder / "rollouts", self.cfg.episodes, seed, self.cfg.temperature, config_hash({"key": key})
-        )
+        hashed, cfg = config_hash({"key": key}), self.cfg
+        request = RolloutRequest(before, folder / "rollouts", cfg.episodes, seed, cfg.temperature, hashed, cfg.rollouts)
 
         def act() -> None:
             (folder / "done.json").unlink(missing_ok=True)
@@ -183,26 +201,25 @@ class _Selu:
                 shutil.rmtree(folder / "rollouts", ignore_errors=True)
             self.collect(request)
 
+        torch.cuda.empty_cache()  # of the last round's model: the actor runs in processes of its own
         first_alone(act)
-        self.load(before)
+        learner = _Learner(self.pipeline, before, self.key)
         if number == 0:
-            self.tune(CRITIC, "selu/practice", [], self.cfg.critic, 1.0, folder / "practice")
-        style = self.model.cfg.prompt
-        trajectories = _trajectories(read_rollouts(request.folder), self.tokenizer)
+            learner.tune(CRITIC, "selu/practice", [], cfg.critic, 1.0, folder / "practice")
+        style = learner.model.cfg.prompt
+        trajectories = _trajectories(read_rollouts(request.folder), learner.tokenizer)
         if not trajectories:
             raise ValueError(f"{request.folder}: the collector wrote no episode")
         goals: dict[tuple[str, str], Relabel] = {}
-        judge: Judge = OracleJudge(goals) if self.cfg.truth == "oracle" else ModelJudge(self.model, self.collator, CRITIC)
+        judge = OracleJudge(goals) if cfg.truth == "oracle" else learner.judge()
         metrics: dict[str, float] = {f"before_{name}": value for name, value in audit(trajectories, {}, judge).items()}
         learnt = critic_examples(trajectories, judge, style, goals)
         for kind in ("direct", "relabel", "negative"):
             metrics[f"critic_{kind}"] = float(sum(one.kind == kind for one in learnt))
-        self.tune(
-            CRITIC, "selu/critic", [one.example for one in learnt], self.cfg.critic, self.cfg.replay_share, folder / "critic"
-        )
-        kept = keep(trajectories, goals, judge, self.cfg.per_class)
+        learner.tune(CRITIC, "selu/critic", [one.example for one in learnt], cfg.critic, cfg.replay_share, folder / "critic")
+        kept = keep(trajectories, goals, judge, cfg.per_class)
         metrics |= {f"after_{name}": value for name, value in audit(trajectories, goals, judge).items()}
-        steps = actor_examples(self.model, kept)
+        steps = actor_examples(learner.model, kept)
         metrics |= {
             "episodes": float(len(trajectories)),
             "actor_success": float(np.mean([t.rollout.success for t in trajectories])),
@@ -210,9 +227,8 @@ class _Selu:
             "kept_relabelled": float(sum(item.relabelled for item in kept)),
             "actor_steps": float(len(steps)),
         }
-        self.tune(ACTOR, "selu/actor", steps, self.cfg.actor, self.cfg.replay_share, folder / "actor")
-        use_adapter(self.model, ACTOR)
-        first_alone(lambda: save_model(self.model.eval(), folder / "model", self.tokenizer))
+        learner.tune(ACTOR, "selu/actor", steps, cfg.actor, cfg.replay_share, folder / "actor")
+        learner.store(folder / "model")
         first_alone(lambda: finish(folder, key, metrics))
         return metrics
 
@@ -226,8 +242,10 @@ class SeluStage:
     recipe = 5
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
-        """The rounds."""
-        return {"selu": dataclasses.asdict(pipeline.cfg.selu)}
+        """The rounds, whoever runs the episodes."""
+        settings = dataclasses.asdict(pipeline.cfg.selu)
+        del settings["rollouts"]
+        return {"selu": settings}
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
         """Runs the rounds, continuing an interrupted one, and stores the last round's model.
