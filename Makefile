@@ -11,7 +11,7 @@ export WANDB_MODE ?= offline
 # Model weights come from this repository or from a path you give, never from a hub.
 export HF_HUB_OFFLINE ?= 1
 XDIST := -n auto --maxprocesses=4 --dist=worksteal
-EXTRAS := smplx==0.1.28 xgrammar==0.2.8 apache-tvm-ffi==0.1.15.post2 holosoma-retargeting==0.1.0
+EXTRAS := smplx==0.1.28 xgrammar==0.2.8 apache-tvm-ffi==0.1.15.post2 holosoma-retargeting==0.1.0 bitsandbytes==0.50.2
 QUICK := tests/configs tests/interface tests/model tests/planners tests/report \
   $(addprefix --ignore=tests/,$(addprefix report/test_,export.py figures.py notebook.py reconstruction.py tokenizer.py video.py) \
   $(addprefix planners/,chat/dag_plan/test_episode.py scripted/test_planner.py test_released.py))
@@ -41,10 +41,10 @@ test-slow: $(STAMP)
 extras: $(STAMP)
 	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target $(VENV)/extras $(EXTRAS)
 
-# The tests of what the environment goes without: SMPL-X, grammar-constrained replies, real motion clips.
+# The tests of what the environment goes without: SMPL-X, grammar-constrained replies, real motion clips, layers in 4 bits.
 test-extras: extras
 	PYTHONPATH=$(VENV)/extras $(BIN)/python -m pytest $(XDIST) $(PYTEST_ARGS) \
-	  $(addprefix tests/,data/test_amass.py data/test_omomo.py data/test_retarget.py backends/test_grammar.py)
+	  $(addprefix tests/,data/test_amass.py data/test_omomo.py data/test_retarget.py backends/test_grammar.py model/test_four_bit.py)
 
 # What needs no simulator, for the minute between two edits.
 quick: $(STAMP)

@@ -11,6 +11,7 @@ COMMANDS: Final = {
     "report": ("proprio_mllm.report.commands", "tables, pages, films and exports of runs, motion data and tokenizers"),
     "bodyqa": ("proprio_mllm.report.bodyqa", "questions about what a model sees and feels of its own body"),
     "memory": ("proprio_mllm.planners.memory_build", "the memory of LLM-Planner and RAP, from demonstrations"),
+    "push": ("proprio_mllm.training.push", "released weights to the Hugging Face hub"),
     "serve": ("proprio_mllm.backends.serve", "a checkpoint as an OpenAI-compatible server"),
 }
 

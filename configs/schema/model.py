@@ -208,6 +208,8 @@ class ModelConfig:
         prompt: `terse` for models that learn the format, `full` for models that read English.
         vocab_size: rows of the tokenizer trained on the project's text; ignored with `weights`.
         dtype: parameter type.
+        four_bit: whether the frozen layers of the language model are held in 4 bits (QLoRA's NF4, doubly quantised); with
+            `weights`, and the extra `four-bit`.
         sees: whether a picture stands before each answer of an episode (`proprio_mllm.model.wording`).
         proprioception: whether motion tokens do too.
     """
@@ -219,6 +221,7 @@ class ModelConfig:
     sees: bool = False
     vocab_size: int = 1400
     dtype: Literal["float32", "bfloat16"] = "float32"
+    four_bit: bool = False
     proprioception: bool = True
     text: TinyTextConfig = field(default_factory=TinyTextConfig)
     vision: TinyVisionConfig = field(default_factory=TinyVisionConfig)
@@ -229,6 +232,7 @@ class ModelConfig:
     motion: MotionTokenizerConfig = field(default_factory=MotionTokenizerConfig)
 
     def __post_init__(self) -> None:
+        require(not self.four_bit or self.weights is not None, "four_bit is for released weights: set weights")
         require(self.image_size > 0 and self.image_size % 28 == 0, f"image_size {self.image_size} must be a multiple of 28")
         require(
             not (self.cse.enabled and self.point_map.encoder == "none"),

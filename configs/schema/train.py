@@ -294,4 +294,5 @@ class TrainConfig:
             f"practice.student {self.practice.student!r}: the model of stage words acts, unless model.weights are given",
         )
         require(not self.shard or self.model.weights is not None, "shard=true shares a frozen backbone; set model.weights")
+        require(not (self.shard and self.model.four_bit), "shard=true cannot share layers of 4 bits: leave out one of the two")
         require(self.micro_batches >= 1, f"micro_batches {self.micro_batches} must be at least 1")

@@ -15,6 +15,7 @@ model is a folder, safetensors and JSON only:
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import os
 import shutil
@@ -28,7 +29,7 @@ import torch
 from peft import LoraConfig as PeftLoraConfig
 from peft import PeftModel, get_peft_model
 from torch import Tensor, nn
-from transformers import Qwen2_5_VLForConditionalGeneration
+from transformers import BitsAndBytesConfig, Qwen2_5_VLForConditionalGeneration
 
 from configs.schema.model import ModelConfig
 from configs.validate import build
@@ -105,7 +106,8 @@ def build_model(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         if cfg.weights is not None:
-            vlm = Qwen2_5_VLForConditionalGeneration.from_pretrained(cfg.weights, dtype=dtype)
+            quantised = _four_bits(dtype) if cfg.four_bit else {}
+            vlm = Qwen2_5_VLForConditionalGeneration.from_pretrained(cfg.weights, dtype=dtype, **quantised)
         else:
             vlm = Qwen2_5_VLForConditionalGeneration(backbone_config(cfg, processor)).to(dtype)
         _extend(vlm, len(processor.tokenizer))
@@ -113,6 +115,25 @@ def build_model(
         if point_map is None and cfg.cse.enabled:
             point_map = build_point_map(cfg)
         return ProprioMLLM(vlm, cfg, processor, motion_ids, point_map)
+
+
+def _four_bits(dtype: torch.dtype) -> dict[str, Any]:
+    """What makes Transformers hold the language model's layers in 4 bits; they have to be read on the device that uses them.
+
+    Raises:
+        ValueError: without bitsandbytes.
+    """
+    if importlib.util.find_spec("bitsandbytes") is None:
+        raise ValueError("model.four_bit=true needs bitsandbytes: pip install 'proprio-mllm[four-bit]'")
+    quantisation = BitsAndBytesConfig(
+        load_in_4bit=True,
+        bnb_4bit_quant_type="nf4",
+        bnb_4bit_use_double_quant=True,
+        bnb_4bit_compute_dtype=dtype,
+        llm_int8_skip_modules=["model.visual", "lm_head"],
+    )
+    device = torch.cuda.current_device() if torch.cuda.is_available() else "cpu"
+    return {"quantization_config": quantisation, "device_map": {"": device}}
 
 
 def add_adapter(model: ProprioMLLM, name: str = "default", start: str | None = None) -> None:

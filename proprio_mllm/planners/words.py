@@ -138,7 +138,7 @@ class WordsPlanner:
             WeightsError: when the folder has no model.
         """
         model = load_model(check_weights(folder, train), adapter)
-        if isinstance(model.vlm, PeftModel) and model.table.dtype == torch.float32:
+        if isinstance(model.vlm, PeftModel) and model.table.dtype == torch.float32 and not model.cfg.four_bit:
             merge_adapter(model)  # halves a reply; at half precision it would round the adapter off
         device = "cuda" if torch.cuda.is_available() else "cpu"
         return WordsPlanner(model.to(device), load_motion(folder), temperature, insist, reflection)

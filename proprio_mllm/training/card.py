@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+from proprio_mllm.model.backbone import PUBLISHED
+
 _ABOUT: Final = {
     "practice": "A language model from scratch that plans in words: it reads the episode so far and answers with a plan step.",
     "base": "The language model of `words` that has learnt to see; it stands in for a pretrained Qwen2.5-VL at this size.",
@@ -19,6 +21,10 @@ _WITHOUT: Final = {
     "no_mpe_cse": " Ablation: without the motion-based position embedding and the cross-spatial encoder.",
     "no_proprio": " Control: the same training without motion tokens and both.",
 }
+_OWN: Final = "It is of a size for tests on a laptop and not comparable with the\npaper's 7B model."
+_OTHERS: Final = "What was added to the base model is here; its weights and their licence are where it is."
+_ALONE: Final = ", and on nothing else: no text or picture of people"
+_ADDED: Final = ", beside what the base model had learnt"
 _PLANNERS: Final = {"practice": "words", "base": "base"}
 
 
@@ -40,12 +46,15 @@ def model_card(provenance: Mapping[str, Any]) -> str:
     ]
     commands = "\n".join(f"    {record['command']}" for record in provenance["stages"].values())
     shards = ", ".join(f"{kind} `{key}`" for kind, key in provenance["shards"].items())
+    weights = provenance["config"]["model"].get("weights")
+    beside = _ADDED if weights else _ALONE
+    base = f"base_model: {weights}\n" if weights in PUBLISHED else ""
     return f"""---
-license: apache-2.0
+license: {"other" if weights else "apache-2.0"}
 library_name: proprio-mllm
 pipeline_tag: robotics
 language: en
-tags: [embodied-planning, dual-arm, humanoid, mujoco]
+{base}tags: [embodied-planning, dual-arm, humanoid, mujoco]
 ---
 
 # Proprio-MLLM {model}, {name}
@@ -54,7 +63,7 @@ tags: [embodied-planning, dual-arm, humanoid, mujoco]
 
     python eval.py planner={planner} robot=h1
 
-**Trained** on what the simulator and the project's rules make, and on nothing else: no text or picture of people. Seed
+**Trained** on what the simulator and the project's rules make{beside}. Seed
 {provenance["seed"]}; shards {shards}. Stored as {provenance["stored_as"]}.
 
 {commands}
@@ -66,6 +75,5 @@ tags: [embodied-planning, dual-arm, humanoid, mujoco]
 {chr(10).join(rows)}
 
 **Limits.** It knows this simulator's actions, codes and instructions in English, and no others; it says nothing about what is
-safe for people or property, and has never driven a robot. It is of a size for tests on a laptop and not comparable with the
-paper's 7B model.
+safe for people or property, and has never driven a robot. {_OTHERS if weights else _OWN}
 """

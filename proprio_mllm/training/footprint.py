@@ -37,6 +37,8 @@ _TEXT_TOKENS: Final = 253
 _CUT3R_TOKENS: Final = 768
 #: Bytes per trained parameter besides its weight: gradient and AdamW's two moments, float32.
 _TRAINING_BYTES: Final = 12
+#: Bytes per weight in 4 bits, with the doubly quantised scales of its block of 64.
+_FOUR_BIT_BYTES: Final = 0.516
 _GPUS: Final = (1, 8, 64)
 
 
@@ -46,10 +48,10 @@ class Part:
 
     parameters: int
     trained: int
-    width: int
+    width: float
 
     @property
-    def bytes(self) -> int:
+    def bytes(self) -> float:
         """Of its weights, gradients and optimiser."""
         return self.parameters * self.width + self.trained * _TRAINING_BYTES
 
@@ -149,7 +151,7 @@ def footprint(cfg: TrainConfig) -> Footprint:
         if isinstance(one, nn.Linear) and re.fullmatch(LORA_TARGETS, name)
     )
     parts = {
-        "language model's layers": Part(layers, 0, width),
+        "language model's layers": Part(layers, 0, _FOUR_BIT_BYTES if model.four_bit else width),
         "vision tower": Part(vision - merger, 0, width),
         "merger": Part(merger, merger, width),
         "tables and last norm": Part(_count(vlm) - layers - vision, 0, width),

@@ -15,7 +15,7 @@ from sim.__main__ import COMMANDS as SIM
 
 
 def test_there_are_few_tools_and_each_has_a_main() -> None:
-    assert len(SIM) + len(PROPRIO) <= 13
+    assert len(SIM) + len(PROPRIO) <= 14
     for module, meaning in [*SIM.values(), *PROPRIO.values(), *REPORT.values()]:
         assert callable(importlib.import_module(module).main)
         assert meaning

@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
+from configs.schema.model import ModelConfig
 from configs.schema.train import LoopConfig
 from proprio_mllm.model.batch import Batch, Collator, Example
 from proprio_mllm.model.building import add_adapter, build_model, build_processor, save_model
@@ -68,9 +69,9 @@ class Mixed(Objective):
         return module(batch).loss, {}
 
 
-def given(folder: Path) -> Path:
+def given(folder: Path, cfg: ModelConfig | None = None) -> Path:
     """A small backbone with its processor, as released weights are."""
-    cfg = small()
+    cfg = cfg or small()
     save_model(build_model(cfg, build_processor(cfg, TEXTS, TYPES)), folder)
     shutil.copytree(folder / "processor", folder / "vlm", dirs_exist_ok=True)
     return folder / "vlm"
