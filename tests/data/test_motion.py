@@ -1,3 +1,5 @@
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
@@ -85,6 +87,14 @@ def test_wrap_and_resample() -> None:
     np.testing.assert_allclose(wrap_angle([3.5, -3.5]), [3.5 - 2 * np.pi, 2 * np.pi - 3.5])
     line = np.arange(31)[:, None] / 30.0
     np.testing.assert_allclose(resample(line, 30.0, 20.0)[:, 0], np.arange(21) / 20.0)
+
+
+@pytest.mark.parametrize(("fps_from", "fps_to"), [(30, 20), (20, 30), (120, 20), (100, 3), (7, 20), (20, 20)])
+def test_resampling_keeps_the_frames_that_fit_into_the_duration(fps_from: int, fps_to: int) -> None:
+    for frames in range(1, 80):
+        fits = int(Fraction(frames - 1, fps_from) * fps_to) + 1
+        ramp = np.arange(frames) / fps_from
+        np.testing.assert_allclose(resample(ramp, fps_from, fps_to), np.arange(fits) / fps_to, atol=1e-12)
 
 
 @pytest.mark.parametrize(
