@@ -140,7 +140,7 @@ class Belief:
 
     def _facts_of(self, name: str) -> ObjectFacts:
         state = self.state
-        opened, filled, place = state.is_in(Condition.OPEN, name), state.is_in(Condition.FILLED, name), state.at.get(name)
+        opened, place = state.is_in(Condition.OPEN, name), state.at.get(name)
         return ObjectFacts(
             object_id=name,
             can=_CAN[name not in state.self_closing, name not in self.light],
@@ -149,7 +149,7 @@ class Belief:
             two_handed=name in self.heavy,
             openness=0.5 if opened is None else float(opened),
             on=state.is_in(Condition.ON, name),
-            fill=0.0 if filled is False else 0.5,
+            fill=0.5,
             dirty=state.is_in(Condition.DIRTY, name) is not False,
             sliced=state.is_in(Condition.SLICED, name) is True,
             used_up=state.is_in(Condition.USED_UP, name) is True,

@@ -61,7 +61,7 @@ def verbs_of(instruction: str) -> tuple[str, ...]:
     """Names of the verbs that an instruction aims at, in the order of `VERBS`; empty when it shows none."""
     text = instruction.replace(", which is closed", "")
     found = [name for name, verb in VERBS.items() if verb.pattern.search(text)]
-    if "place" in found and re.search(r"\bset (both )?hands\b", text):
+    if re.search(r"\bset (both )?hands\b", text):  # the word showed placing
         found.remove("place")
     for strong, means in _MEANS:
         if strong in found and means in found:

@@ -90,7 +90,7 @@ def _moved(batch: Any, device: torch.device) -> Any:
     """Tensors, and batches that can move themselves, on a device; tuples item by item."""
     if isinstance(batch, tuple):
         return tuple(_moved(item, device) for item in batch)
-    return batch.to(device) if hasattr(batch, "to") and device.type != "cpu" else batch
+    return batch.to(device) if hasattr(batch, "to") else batch
 
 
 def make_optimizer(module: nn.Module, cfg: LoopConfig) -> torch.optim.Optimizer:

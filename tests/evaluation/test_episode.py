@@ -9,7 +9,7 @@ import pytest
 
 from interface.episode import Outcome
 from interface.failures import FailureCategory
-from proprio_mllm.evaluation.episode import GoalReport, Limits, run_episode
+from proprio_mllm.evaluation.episode import GoalReport, Limits, Stats, run_episode
 from proprio_mllm.evaluation.ledger import Ledger, read_ledger
 from proprio_mllm.planners.protocol import Usage
 
@@ -127,6 +127,34 @@ def test_invalid_replies_never_crash(session, scripted, fields, text) -> None:
     assert (record.invalid_output, record.steps) == (3, 3)
 
 
+def test_the_trace_of_an_invalid_reply_says_what_it_was(session, scripted, fields) -> None:
+    record = play(session(), scripted("Fly(Mug_1)" + "!" * 1000), fields)
+    (outcome,) = record.trace[0]["outcomes"]
+    assert (outcome["action"], outcome["ok"], outcome["code"], outcome["category"]) == ("", False, "InvalidOutput", "logical")
+    assert outcome["message"] and len(outcome["message"]) <= 200
+    assert (record.trace[0]["step"], record.trace[0]["duration_s"]) == ("Fly(Mug_1)" + "!" * 390, 0.0)
+
+
+def test_measured_numbers_are_rounded(session, scripted, fields, monkeypatch) -> None:
+    one, third = session(), 1.0 / 3.0
+    act = one.step
+
+    def step(asked):
+        observation, feedback = act(asked)
+        outcomes = tuple(dataclasses.replace(outcome, margins={"reach_m": third}) for outcome in feedback.outcomes)
+        return observation, dataclasses.replace(feedback, outcomes=outcomes, duration_s=third)
+
+    monkeypatch.setattr(one, "step", step)
+    monkeypatch.setattr(one, "stats", lambda: Stats(third, third, third))
+    planner = scripted("MoveAhead()")
+    said = planner.step
+    planner.step = lambda *seen: dataclasses.replace(said(*seen), latency_s=third / 2, usage=Usage(1, usd=third / 2))
+    record = play(one, planner, fields)
+    assert record.trace[0]["duration_s"] == 0.333 and record.trace[0]["outcomes"][0]["margins"] == {"reach_m": 0.3333}
+    assert (record.path_length_m, record.makespan_s, record.arm_utilisation) == (0.333, 0.333, 0.3333)
+    assert (record.planner_s, record.planner_usd) == (0.3333, 0.33333333)
+
+
 def test_errors_are_recorded_not_scored(session, scripted, fields) -> None:
     record = play(session(broken=2), scripted(*SOLVED), fields)
     assert record.outcome is Outcome.INFRASTRUCTURE_ERROR
@@ -159,6 +187,8 @@ def test_a_planner_may_count_in_numpy_but_not_in_nan(session, scripted, fields, 
         (Usage(1, usd=None, models=("half \ud83d",)), ""),
         (Usage(1.5), "'float' object cannot be interpreted as an integer"),
         (Usage(-1), "the reply's calls are below 0"),
+        (Usage(1, cached=2**63), "the reply's cached are below 0 or above 2**63"),
+        (Usage(1, cached=2**63 - 1), ""),
         (Usage(1, usd=float("inf")), "the reply's usage.usd is inf"),
         (Usage(1, models=(3,)), r"usage.models are (3,); allowed: names"),
         (None, "'NoneType' object has no attribute"),

@@ -10,7 +10,7 @@ import pytest
 from interface.episode import Outcome
 from interface.failures import FailureCategory
 from proprio_mllm.evaluation.episode import Limits, run_episode
-from proprio_mllm.evaluation.ledger import Ledger, LedgerError, key_of, read_ledger, scored
+from proprio_mllm.evaluation.ledger import Ledger, LedgerError, from_json, key_of, read_ledger, scored, to_json
 from proprio_mllm.evaluation.seeds import episode_seed, stream
 
 
@@ -20,11 +20,25 @@ def record(session, scripted, fields):
 
 
 def test_round_trip(tmp_path, record) -> None:
-    path = tmp_path / "deep" / "ledger.jsonl"
+    path = tmp_path / "not" / "yet" / "there" / "ledger.jsonl"
     with Ledger(path) as ledger:
         ledger.append(record)
     (again,) = read_ledger(path)
     assert again == record and again.failure is FailureCategory.LOGICAL  # a step too far, then a reply that is none
+
+
+LACKING = {1: ("in_time", "stuck", "cached_calls", "reflections", "planner_usd", "models"), 2: ("in_time", "stuck"), 3: ()}
+
+
+@pytest.mark.parametrize("version", LACKING)
+def test_lines_of_earlier_versions_are_read(record, version) -> None:
+    now = to_json(record)
+    line = {name: value for name, value in now.items() if name not in LACKING[version]} | {"version": version}
+    assert from_json(line) == from_json(now)
+    with pytest.raises(LedgerError, match=r"missing fields \[\], unknown fields \['mood'\]"):
+        from_json(line | {"mood": 1})
+    with pytest.raises(LedgerError, match=r"missing fields \['steps'\]"):
+        from_json({name: value for name, value in line.items() if name != "steps"})
 
 
 def test_half_a_character_is_a_question_mark(tmp_path, record) -> None:

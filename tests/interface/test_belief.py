@@ -7,14 +7,15 @@ from collections import Counter
 import pytest
 
 from interface.belief import Belief
+from interface.effects import Condition
 from interface.observation import HistoryItem
 from interface.steps import Action
 from proprio_mllm.evaluation.lessons import WordsOnly
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 
 
-def believed(*log: str) -> Belief:
-    return Belief.of([HistoryItem(line.rpartition(" ")[0], line) for line in log])
+def believed(*log: str, shutting: tuple[str, ...] = ()) -> Belief:
+    return Belief.of([HistoryItem(line.rpartition(" ")[0], line) for line in log], shutting)
 
 
 @pytest.mark.parametrize(
@@ -41,10 +42,38 @@ def believed(*log: str) -> Belief:
         ((), "Fill(left, Sink_1)", "HandEmpty"),
         (("Pick(left, Cup_1) ok",), "Fill(left, Sink_1)", None),  # whether water runs nobody has told
         (("Pick(left, Cup_1) ok", "ToggleOff(right, Sink_1) ok"), "Fill(left, Sink_1)", "SourceOff"),
+        (("Pick(left, Cup_1) ok",), "Pour(left, Bowl_1)", None),  # whether it is filled nobody has told
+        (("Lift(Rug_1) NotLiftable",), "Lift(Rug_1)", "NotLiftable"),
+        (("Pick(left, Mug_1) Broke",), "Pick(right, Mug_1)", "ObjectBroken"),
+        (("Pick(left, Mug_1) ok", "Place(left, Shelf_1) Broke"), "Pick(right, Mug_1)", "ObjectBroken"),
+        (("Pick(left, Jug_1) ok", "Place(left, Bowl_1) Broke", "Pick(left, Cup_1) ok"), "Pour(left, Bowl_1)", None),
     ],
 )
 def test_what_is_bound_to_be_refused(log: tuple[str, ...], call: str, code: str | None) -> None:
     assert believed(*log).refusal(Action.parse(call)) == code
+
+
+@pytest.mark.parametrize(
+    ("log", "call", "code"),
+    [
+        (("Open(left, Drawer_1) ok",), "GoTo(Shelf_1)", "InUse"),
+        (("Open(left, Drawer_1) ok",), "Pick(left, Mug_1)", "HandOccupied"),
+        (("Open(left, Drawer_1) ok",), "Pick(right, Drawer_1)", "AlreadyHeld"),
+        (("Open(left, Drawer_1) ok", "Pick(right, Mug_1) ok"), "Place(right, Drawer_1)", None),
+        (("Open(left, Drawer_1) ok", "Release(left) ok"), "GoTo(Shelf_1)", None),
+        ((), "Pick(left, Drawer_1)", "NotPickupable"),
+        (("Lift(Drawer_1) NotLiftable",), "Lift(Drawer_1)", "NotLiftable"),
+    ],
+)
+def test_a_door_that_falls_shut_stays_in_the_hand(log: tuple[str, ...], call: str, code: str | None) -> None:
+    assert believed(*log, shutting=("Drawer_1",)).refusal(Action.parse(call)) == code
+
+
+def test_what_is_behind_the_door_that_was_just_opened_tells_that_it_is_shut_again() -> None:
+    opened = believed("Open(left, Drawer_1) ok", "Pick(right, Mug_1) ReceptacleClosed")
+    assert opened.state.is_in(Condition.OPEN, "Drawer_1") is False
+    assert opened.shut_away == {"Mug_1"}
+    assert believed("Pick(right, Mug_1) ReceptacleClosed").state.conditions[Condition.OPEN] == {}
 
 
 def test_what_is_held_against_an_action_is_so() -> None:

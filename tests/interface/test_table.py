@@ -90,6 +90,11 @@ LEFT_MUG = {Arm.LEFT: "Mug_1"}
         ("GoTo(Table_1)", world(hands={Arm.LEFT: "Fridge_1"}), "InUse"),  # a hand at a door keeps the robot there
         ("GoTo(Table_1)", world(hands=LEFT_MUG), ""),
         ("ResetArm(left)", world(hands={Arm.LEFT: "Fridge_1"}), "InUse"),
+        ("Hold(left, Fridge_1)", world(), ""),  # a door is held like a load, but is none
+        ("Hold(left, Bread_1)", world(), ""),
+        ("Hold(left, Box_1)", world(), "NeedsTwoHands"),
+        ("Hold(left, Table_1)", world(), "NotPickupable"),
+        ("Hold(left, Bread_1)", world(inside={"Bread_1": "Fridge_1"}), "ReceptacleClosed"),
     ],
 )
 def test_the_first_requirement_that_fails_decides(text: str, facts: Facts, expected: str) -> None:
@@ -116,9 +121,22 @@ def test_shares_decide_what_is_open_filled_and_full() -> None:
     assert [(one.filled, one.full) for one in levels] == [(False, False)] * 2 + [(True, False)] * 2 + [(True, True)] * 2
 
 
-def test_margins_come_with_weight() -> None:
-    refusal = first_refusal(Action.parse("Pick(left, Box_1)"), world(mass_kg=3.5))
-    assert refusal is not None and dict(refusal.margins) == {"mass_kg": 1.5}
+@pytest.mark.parametrize(
+    ("text", "mass_kg", "expected", "over_kg"),
+    [
+        ("Pick(left, Box_1)", 3.5, "TooHeavy", 1.5),  # two arms carry 2 kg
+        ("Pick(left, Box_1)", 1.25, "NeedsTwoHands", 0.25),  # one carries 1 kg
+        ("Lift(Box_1)", 3.5, "TooHeavy", 1.5),
+    ],
+)
+def test_margins_come_with_weight(text: str, mass_kg: float, expected: str, over_kg: float) -> None:
+    refusal = first_refusal(Action.parse(text), world(mass_kg=mass_kg))
+    assert refusal is not None and refusal.code == expected and dict(refusal.margins) == {"mass_kg": over_kg}
+
+
+def test_what_two_arms_just_carry_is_not_too_heavy() -> None:
+    assert code("Lift(Box_1)", world(mass_kg=2.0)) == ""
+    assert code("Pick(left, Box_1)", world(mass_kg=2.0)) == "NeedsTwoHands"
 
 
 def after(*lines: str, shutting: tuple[str, ...] = ()) -> SymbolicState:

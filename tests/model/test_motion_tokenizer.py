@@ -68,6 +68,17 @@ def test_quantiser_against_the_papers_equations():
     assert float(result.perplexity) == pytest.approx(float(entropy.exp()), rel=1e-4)
 
 
+def test_the_first_codes_are_means_of_the_first_encodings():
+    for kind in ("vq", "rvq"):
+        quantizer = _quantizer(quantizer=kind)
+        vectors = torch.randn(1, 60, 3) + 50.0
+        tokens = quantizer(vectors).tokens[0, :, 0]
+        first = quantizer.inner.codebook if kind == "vq" else quantizer.inner.layers[0].codebook
+        assert len(tokens.unique()) == 7
+        for code, vector in enumerate(first):
+            torch.testing.assert_close(vector, vectors[0, tokens == code].mean(0), atol=0.5, rtol=0.0)
+
+
 def test_residual_codebooks_quantise_what_is_left_over():
     quantizer = _quantizer(quantizer="rvq", stages=2)
     quantizer(torch.randn(1, 40, 3))
@@ -230,16 +241,17 @@ def test_round_trip_continues_training_alike(tmp_path):
     torch.manual_seed(0)
     tokenizer = MotionTokenizer(CFG).train()
     tokenizer(_motion(8))
-    tokenizer.save(tmp_path / "t")
-    loaded = MotionTokenizer.load(tmp_path / "t")
+    for _ in range(2):
+        tokenizer.save(tmp_path / "not" / "yet" / "t")
+    loaded = MotionTokenizer.load(tmp_path / "not" / "yet" / "t")
     assert not loaded.training
     for name, value in tokenizer.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], value), name
-    assert not list((tmp_path / "t").glob("*.tmp"))
-    config = tmp_path / "t" / "config.json"
+    config = tmp_path / "not" / "yet" / "t" / "config.json"
+    assert not list(config.parent.glob("*.tmp"))
     config.write_text(json.dumps({**json.loads(config.read_text()), "format": 7}))
     with pytest.raises(ValueError, match="format 7"):
-        MotionTokenizer.load(tmp_path / "t")
+        MotionTokenizer.load(config.parent)
 
 
 @pytest.mark.parametrize("shape", [(2, 16, 4), (2, 15, 5), (16, 5), (2, 0, 5)])

@@ -58,6 +58,26 @@ def test_residual_starts_as_identity_and_literal_is_the_equation(source):
     literal = CrossSpatialEncoder(CseConfig(source=source, frame="camera", literal=True), 8, 5)
     spatial = literal.spatial(geo, 4, 4, None)
     assert torch.equal(literal(features, spatial), literal.mlp(features + literal.phi(spatial)))
+    residual.load_state_dict(literal.state_dict())
+    torch.testing.assert_close(residual(features, spatial), features + literal(features, spatial))
+
+
+def test_far_points_are_held_to_ten_metres_and_trust_is_a_logarithm():
+    encoder = CrossSpatialEncoder(CseConfig(source="points", frame="camera"), hidden=8, token_dim=0)
+    points = torch.tensor([-30.0, 4.0, 30.0]).expand(1, 4, 4, 3)
+    for conf, trust in ((1.0, 0.0), (float(np.e), 1.0), (0.5, 0.0)):
+        out = encoder.spatial(GeoFeatures(None, points, torch.full((1, 4, 4), conf)), 1, 1, None).reshape(4, 4)
+        torch.testing.assert_close(out, torch.tensor([[-5.0], [2.0], [5.0], [trust]]).expand(4, 4))
+
+
+@pytest.mark.parametrize("grid", [(2, 2), (3, 1), (8, 8), (16, 16)])
+def test_every_token_reaches_the_merged_grid(grid):
+    encoder = CrossSpatialEncoder(CseConfig(source="tokens"), hidden=8, token_dim=1)
+    tokens = torch.ones(1, 1, 8, 8, requires_grad=True)
+    out = encoder.spatial(GeoFeatures(tokens, torch.zeros(1, 8, 8, 3), torch.ones(1, 8, 8)), *grid, None)
+    torch.testing.assert_close(out, torch.ones(1, grid[0] * grid[1], 1))
+    (share,) = torch.autograd.grad(out.sum(), tokens)
+    assert float(share.min()) > 0.0
 
 
 def test_what_the_point_map_makes_of_an_image_is_computed_once(tmp_path, monkeypatch):

@@ -69,6 +69,16 @@ def test_bootstrap_of_constant_clusters_is_a_point() -> None:
         cluster_bootstrap([[1.0], []], np.random.default_rng(0))
 
 
+def test_tasks_that_either_side_wins_make_the_p_value() -> None:
+    a = {f"t{i:02d}": [i < 9] for i in range(14)}
+    b = {f"t{i:02d}": [9 <= i < 11] for i in range(14)}
+    result = compare(a, b)
+    assert (len(result.above), len(result.below)) == (9, 2)
+    assert result.p_value == pytest.approx(2 * (1 + 11 + 55) / 2**11)  # at most two of eleven coins on one side
+    assert (result.first, result.second) == pytest.approx((9 / 14, 2 / 14))
+    assert result.low < result.difference < result.high
+
+
 def test_paired_comparison() -> None:
     a = {f"t{i}": [i < 9] for i in range(12)}
     b = {f"t{i}": [i < 2] for i in range(12)} | {"other": [True]}
@@ -77,6 +87,7 @@ def test_paired_comparison() -> None:
     assert result.difference == pytest.approx(7 / 12)
     assert result.p_value == pytest.approx(2 * 0.5**7)
     assert 0 < result.low < result.difference < result.high <= 1
+    assert (result.above, result.below) == (tuple(f"t{i}" for i in range(2, 9)), ())
     assert compare(a, a).p_value == 1.0
     with pytest.raises(ValueError, match="no common task"):
         compare(a, {"x": [True]})

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -14,11 +16,23 @@ from configs.schema.model import ModelConfig
 from configs.schema.train import TrainConfig
 from configs.validate import build
 from proprio_mllm.evaluation.lessons import Lessons
+from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import build_model, build_processor
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.word_tokens import add_word_tokens, known_words
 from proprio_mllm.model.wording import id_words, read_step
-from proprio_mllm.training.critic import Judge, Kept, Trajectory, actor_examples, audit, critic_examples, keep
+from proprio_mllm.training import critic
+from proprio_mllm.training.critic import (
+    Judge,
+    Kept,
+    ModelJudge,
+    OracleJudge,
+    Trajectory,
+    actor_examples,
+    audit,
+    critic_examples,
+    keep,
+)
 from proprio_mllm.training.goals import Relabel
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.pipeline import base_model_config
@@ -116,6 +130,53 @@ def test_a_hallucinated_yes_lowers_precision() -> None:
     scores = audit([wrong], {}, Scripted({("b", 4, "Pick up the mug.")}))
     assert scores["precision"] == 0.0
     assert "recall" not in scores
+
+
+def test_a_goal_comes_true_through_a_step_that_worked() -> None:
+    """Right after the failed step, and before the first one, nobody asks."""
+    pick, whole = "Pick up the plate.", trajectory("b", PICK_PLATE, "Pick up the plate.", True)
+    always = {("b", at, pick) for at in range(5)}
+    ends = [keep([whole], {}, Scripted(always - {("b", at, pick) for at in nos}), 10)[0].end for nos in ((), (1,), (1, 3))]
+    assert ends == [1, 3, 4]
+
+
+def test_the_oracle_knows_the_end_alone() -> None:
+    picked = trajectory("b", PICK_PLATE, "Pick up the mug.", False)
+    relabelled = {
+        ("b", "Pick up the plate."): Relabel("Pick up the plate.", (("pick", "Plate_1", ""),), ()),
+        ("b", "Pick up both."): Relabel("Pick up both.", (("pick", "Plate_1", ""), ("pick", "Mug_1", "")), ()),
+        ("b", "Open it."): Relabel("Open it.", (("open", "Plate_1", ""),), ()),
+    }
+    oracle = OracleJudge(relabelled)
+    goals = ["Pick up the plate.", "Pick up both.", "Open it.", "Pick up the mug.", "Dance!"]
+    assert [oracle.truth(picked.rollout, goal) for goal in goals] == [True, False, False, False, None]
+    assert oracle.completed([(picked, 4, goal) for goal in goals]) == [True, False, False, False, False]
+    done = trajectory("a", PICK_PLATE, "Pick up the plate.", True)
+    assert oracle.completed([(done, at, "Pick up the plate.") for at in range(5)]) == [False] * 4 + [True]
+    assert [oracle.ask(picked, relation) for relation in ("held", "open")] == ["Plate_1", "none"]
+
+
+def test_the_model_answers_every_question_under_the_critics_adapter(monkeypatch: pytest.MonkeyPatch) -> None:
+    told, sizes, adapters = iter(["Yes.", " no", "yes", "perhaps", "No, yes", "Plate_1"]), list[tuple[int, int]](), list[str]()
+
+    class Batch(list[Example]):
+        def to(self, device: str) -> Batch:
+            return self
+
+    def reply(batch: Batch, tokens: int) -> list[str]:
+        sizes.append((len(batch), tokens))
+        return [next(told) for _ in batch]
+
+    monkeypatch.setattr(critic, "use_adapter", lambda model, name: adapters.append(name))
+    model = SimpleNamespace(cfg=SimpleNamespace(prompt="terse"), eval=lambda: None, device="cpu", reply=reply)
+    collator = cast(Collator, lambda examples, generation: Batch(examples))
+    judge = ModelJudge(cast(ProprioMLLM, model), collator, size=2)
+    whole = trajectory("b", PICK_PLATE, "Pick up the mug.", False)
+    assert judge.completed([(whole, at, "Pick up the mug.") for at in range(5)]) == [True, False, True, False, False]
+    assert [size for size, _ in sizes] == [2, 2, 1]
+    assert judge.ask(whole, "held") == "Plate_1"
+    assert sizes[-1][0] == 1 and sizes[-1][1] > sizes[0][1]  # ids are longer than a yes
+    assert set(adapters) == {"critic"}
 
 
 def test_duplicates_and_caps() -> None:

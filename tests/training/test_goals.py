@@ -23,6 +23,8 @@ INVENTORY = ("Mug_1", "Plate_1", "CoffeeTable_1", "Fridge_1", "Lamp_1", "Lamp_2"
         ("The fridge should not stay open.", ("close",)),
         ("Switch the lamp off.", ("turn_off",)),
         ("Lift the box with both hands.", ("lift",)),
+        ("The fridge: set hands to it and close it.", ("close",)),
+        ("There is a box to set both hands to.", ("lift",)),
         ("Dance!", ()),
     ],
 )

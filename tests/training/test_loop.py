@@ -17,6 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from configs.schema.train import LoggerConfig, LoopConfig
+from proprio_mllm.training import loop
 from proprio_mllm.training.loop import Objective, Parts, learning_rate, run_loop
 from proprio_mllm.training.metrics import MetricWriter
 
@@ -88,6 +89,40 @@ def test_parts_add_up_to_their_batch(tmp_path: Path) -> None:
     assert float(first[0]["loss"]) == pytest.approx(float(first[1]["loss"]), rel=1e-3)
 
 
+def test_as_many_batches_are_made_as_steps_are_taken(tmp_path: Path) -> None:
+    made: list[int] = []
+
+    class Counted(Line):
+        def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> Tensor:
+            made.append(size)
+            return super().batch(rng, size)
+
+    run_loop(Counted(), CFG, tmp_path, 5, None, micro_batches=2)
+    assert made == [CFG.batch // 2] * (2 * CFG.steps)
+
+
+def test_passes_that_keep_others_company_teach_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process with fewer parts than others repeats its first one, here one without a loss."""
+
+    class Learnt(Line):
+        def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> Parts:
+            return Parts((torch.zeros(2, 3), super().batch(rng, size)))
+
+        def loss(self, module: nn.Module, batch: Tensor, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
+            self.seen += 1
+            told = module(batch)
+            return (told - (batch.sum(1, keepdim=True) if batch.any() else told.detach())).square().mean(), {}
+
+    found = []
+    for idle in (0, 3):
+        monkeypatch.setattr(loop, "is_sharded", lambda module: True)
+        monkeypatch.setattr(loop, "largest", lambda own, idle=idle: own + idle)
+        objective = Learnt()
+        found.append(run(tmp_path / str(idle), objective))
+        assert objective.seen == (2 + idle) * CFG.steps
+    assert all(torch.equal(x, y) for x, y in zip(*found, strict=True))
+
+
 SCRIPT = """
 import sys, time
 from pathlib import Path
@@ -146,7 +181,7 @@ def test_learning_rate_warms_up_and_decays() -> None:
     cfg = LoopConfig(steps=100, batch=1, lr=1.0, warmup=10, minutes=1.0)
     assert learning_rate(cfg, 0) == pytest.approx(0.1)
     assert learning_rate(cfg, 10) == pytest.approx(1.0)
-    assert learning_rate(cfg, 100) == pytest.approx(0.1)
+    assert [learning_rate(cfg, step) for step in (55, 100, 120)] == pytest.approx([0.55, 0.1, 0.1])
     assert learning_rate(cfg, 10, seconds=60.0) == pytest.approx(0.1)
     share = [learning_rate(cfg, 10, seconds=seconds) for seconds in (15.0, 30.0, 45.0)]
     assert share == pytest.approx([0.1 + 0.45 * (1.0 + 0.5**0.5), 0.55, 0.1 + 0.45 * (1.0 - 0.5**0.5)])  # a cosine, no line

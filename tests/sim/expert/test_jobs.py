@@ -4,6 +4,7 @@ import pytest
 
 from interface.bodies import Arm
 from interface.facts import Affordances, Facts, ObjectFacts
+from interface.steps import Action
 from sim.expert.jobs import Job, Setting, pending_leaves, plan_jobs
 from sim.tasks.predicates import Predicate
 
@@ -65,6 +66,14 @@ LAMP = Predicate("toggled_on", "Lamp_1")
         ([Predicate("held", "Mug_1"), LAMP], facts(), [Job("ToggleOn", "Lamp_1"), Job("Pick", "Mug_1")]),
         ([Predicate("lifted", "Box_1")], facts(held={RIGHT: "Egg_1"}), [Job("Place", "Counter_1", RIGHT)]),
         ([LAMP, ON_TABLE], facts(lifted="Box_1"), [Job("PlaceBoth", "Table_1")]),
+        # what a goal wants in a hand stays there
+        ([Predicate("held", "Mug_1"), LAMP], facts(held={LEFT: "Mug_1"}), [Job("ToggleOn", "Lamp_1")]),
+        # beside a switch there is one hand for one thing
+        (
+            [Predicate("held", "Mug_1"), Predicate("held", "Egg_1"), LAMP],
+            facts(),
+            [Job("ToggleOn", "Lamp_1"), Job("Pick", "Mug_1")],
+        ),
     ],
 )
 def test_next_jobs(goals, state, expected):
@@ -146,6 +155,8 @@ WORK = Job("Slice", "Apple_1", RIGHT)
         # one arm opens an ordinary door first, because it has no other hand for it later
         ([Predicate("in", "Mug_1", "Cabinet_1")], kitchen(arms=(RIGHT,)), [Job("Open", "Cabinet_1")]),
         ([Predicate("in", "Mug_1", "Cabinet_1"), Predicate("in", "Jug_1", "Cabinet_1")], kitchen(), [Job("Open", "Cabinet_1")]),
+        # one hand stays free for a door that falls shut
+        ([Predicate("in", "Mug_1", "Drawer_1"), Predicate("in", "Jug_1", "Drawer_1")], kitchen(), [Job("Pick", "Mug_1")]),
         # what was only held where it is is let go of, what was picked up is put back
         ([Predicate("held", "Mug_1")], kitchen({LEFT: "Apple_1"}, Apple_1={"carriers": ("Counter_1",)}),
          [Job("Release", "", LEFT)]),
@@ -154,6 +165,19 @@ WORK = Job("Slice", "Apple_1", RIGHT)
 )  # fmt: skip
 def test_next_jobs_with_tools_liquids_heat_and_springs(goals, state, expected):
     assert plan_jobs(goals, state) == expected
+
+
+@pytest.mark.parametrize(
+    ("job", "arm", "text"),
+    [
+        (Job("Pick", "Mug_1"), LEFT, "Pick(left, Mug_1)"),
+        (Job("Lift", "Box_1"), LEFT, "Lift(Box_1)"),
+        (Job("PlaceBoth", "Table_1"), None, "PlaceBoth(Table_1)"),
+        (Job("ResetArm", "", RIGHT), RIGHT, "ResetArm(right)"),
+    ],
+)
+def test_a_job_is_an_action_of_the_grammar(job, arm, text):
+    assert job.action(arm) == Action.parse(text)
 
 
 def test_of_an_exists_the_missing_objects_are_fetched():

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import chisquare
 
 from configs.validate import ConfigError, build
+from sim.session import contingency
 from sim.session.contingency import DIFFICULTIES, Contingency, ContingencyConfig, OutcomeRule, load_contingency
 
 FILLED = {"isFilledWithLiquid": True}
@@ -54,6 +55,20 @@ def test_a_success_at_hard_is_a_success_at_medium():
     for step in range(200):
         if hard.draw(step, "Open", "Fridge_1", "Fridge", {}) == "success":
             assert medium.draw(step, "Open", "Fridge_1", "Fridge", {}) == "success"
+
+
+@pytest.mark.parametrize(
+    ("rate", "u", "outcome"),
+    [
+        (0.5, 0.0, "success"), (0.5, 0.4375, "success"), (0.5, 0.5, "spilled"), (0.5, 0.75, "broken"), (0.5, 0.9375, "broken"),
+        (0.0, 0.0, "spilled"), (0.0, 0.5, "broken"), (1.0, 0.9375, "success"),
+    ],
+)  # fmt: skip
+def test_each_outcome_has_its_share_of_the_numbers_from_0_to_below_1(monkeypatch, rate, u, outcome):
+    monkeypatch.setattr(contingency, "_uniform", lambda *key: u)
+    rule = OutcomeRule(("Pick",), (), {}, {"success": 0.5, "spilled": 0.25, "broken": 0.25})
+    config = ContingencyConfig(dict.fromkeys(DIFFICULTIES, rate), (rule,))
+    assert Contingency(config, "natural", 0).draw(0, "Pick", "Mug_1", "Mug", {}) == outcome
 
 
 def test_body_movements_always_succeed():
