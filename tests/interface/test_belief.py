@@ -76,6 +76,25 @@ def test_what_is_behind_the_door_that_was_just_opened_tells_that_it_is_shut_agai
     assert believed("Pick(right, Mug_1) ReceptacleClosed").state.conditions[Condition.OPEN] == {}
 
 
+def test_what_was_done_for_good_is_known_to_be_done() -> None:
+    done = believed("Slice(left, Bread_1) ok", "Clean(left, Plate_1) ok", "UseUp(left, Soap_1) ok", "Pour(left, Mug_1) ok")
+    things = {"sliced": "Bread_1", "clean": "Plate_1", "used_up": "Soap_1", "filled": "Mug_1"}
+    assert all(done.done(kind, name) for kind, name in things.items())
+    assert not any(Belief().done(kind, name) for kind, name in things.items())
+    assert not done.done("cooked", "Bread_1")  # nobody tells
+
+
+def test_legs_that_came_to_their_end_are_taken_to_have_gone_half_the_way() -> None:
+    legs = believed("MoveDown(0.25) ok", "MoveUp(0.125) ok")
+    assert (legs.lowered_m, legs.heights, legs.at_limit) == (0.125, [-0.25, 0.125], set())
+    legs = believed("MoveDown(0.25) ok", "MoveDown(0.5) HeightLimit")
+    assert (legs.lowered_m, legs.heights, legs.at_limit) == (0.5, [-0.25, -0.5], {False})
+    assert believed("MoveUp(0.5) HeightLimit").at_limit == {True}
+    assert believed("MoveDown(0.5) HeightLimit", "MoveUp(0.125) ok").at_limit == set()
+    assert believed("MoveDown(0.25) InUse").lowered_m == 0.0
+    assert believed("MoveDown(0.25) ok", "GoTo(Shelf_1) ok").heights == []  # another stance, as low as before
+
+
 def test_what_is_held_against_an_action_is_so() -> None:
     """In the text world, mistakes among the steps: no refused action succeeds, and most refusals name the code."""
     seen: Counter[str] = Counter()

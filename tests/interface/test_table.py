@@ -76,6 +76,7 @@ LEFT_MUG = {Arm.LEFT: "Mug_1"}
         ("Open(right, Fridge_1)", world(), ""),
         ("ToggleOff(right, Faucet_1)", world(), "AlreadyInState"),
         ("ToggleOn(right, Mug_1)", world(), "NotToggleable"),
+        ("ToggleOn(right, Faucet_1)", world(), ""),
         ("Slice(left, Bread_1)", world(hands=LEFT_MUG), "NeedsTool"),
         ("Slice(left, Mug_1)", world(hands={Arm.LEFT: "Knife_1"}), "NotSliceable"),
         ("Slice(left, Bread_1)", world(hands={Arm.LEFT: "Knife_1"}), "NeedsSteadying"),
@@ -117,6 +118,9 @@ def test_shares_decide_what_is_open_filled_and_full() -> None:
     assert [share for share, one in states.items() if one.open] == [share for share, one in states.items() if not one.shut]
     assert [share for share, one in states.items() if one.shut] == [0.0, 0.05, 0.2]
     assert not replace(door, can=can()).open and not replace(door, can=can()).shut
+    lid, lamp = replace(door, can=can("openable", "lidded")), replace(door, can=can("toggleable"))
+    assert [replace(lid, openness=share).covered for share in (0.0, 0.34)] == [True, False]
+    assert not lamp.covered  # what has no lid is under none
     levels = [replace(door, fill=share) for share in (0.0, 0.09, 0.1, 0.9, 0.999, 1.0)]
     assert [(one.filled, one.full) for one in levels] == [(False, False)] * 2 + [(True, False)] * 2 + [(True, True)] * 2
 
@@ -168,8 +172,11 @@ def test_a_door_that_falls_shut_stays_in_the_hand_and_may_be_shut_when_it_is_let
 def test_steadying_leaves_an_object_where_it_is() -> None:
     state = after("Pick(right, Bread_1) ok", "Place(right, Table_1) ok", "Hold(right, Bread_1) ok")
     assert state.at == {"Bread_1": "Table_1"} and state.in_place == {"Bread_1"}
+    assert state.holders("Bread_1") == ("right",) and not state.holds("Bread_1")
     state.succeed(Action.parse("Pick(right, Bread_1)"))
     assert state.at == {} and state.in_place == set()
+    assert state.holds("Bread_1") and not state.holds("Mug_1")
+    assert after("Lift(Box_1) ok").holds("Box_1")
 
 
 def test_body_and_liquids() -> None:

@@ -88,15 +88,20 @@ def reader() -> ProprioMLLM:
     return build_model(cfg, processor, 0)
 
 
-def taught(model: ProprioMLLM, kept: Sequence[Kept]) -> list[str]:
-    """The steps that the actor is to learn."""
-    words = {token: word for word, token in known_words(model.processor.tokenizer).items()}
-    ids, found = {id_words(name): name for name in KNOWN}, list[str]()
+def taught_words(model: ProprioMLLM, kept: Sequence[Kept]) -> list[list[str]]:
+    """The answers that the actor is to learn."""
+    words, found = {token: word for word, token in known_words(model.processor.tokenizer).items()}, list[list[str]]()
     for example in actor_examples(model, kept):
         assert example.tokens is not None
         pairs = zip(example.tokens.ids, example.tokens.targets, strict=True)
-        found.append(read_step([words[token] for token, target in pairs if target], ids).to_text())
+        found.append([words[token] for token, target in pairs if target])
     return found
+
+
+def taught(model: ProprioMLLM, kept: Sequence[Kept]) -> list[str]:
+    """The steps of these answers."""
+    ids = {id_words(name): name for name in KNOWN}
+    return [read_step(words, ids).to_text() for words in taught_words(model, kept)]
 
 
 PICK_PLATE = [("GoTo(Plate_1)", True), ("Pick(left, Plate_1)", False), ("Pick(right, Plate_1)", True), ("MoveAhead(0.3)", True)]
@@ -185,6 +190,19 @@ def test_duplicates_and_caps() -> None:
     assert len(keep(same, {}, judge, 10)) == 1
     others = [trajectory(name, [(f"MoveAhead(0.{n})", True)], "Pick up the mug.", True) for n, name in enumerate("abcd", 1)]
     assert len(keep(others, {}, judge, 2)) == 2
+
+
+def test_a_sub_goal_is_the_next_work_of_an_arm(reader: ProprioMLLM) -> None:
+    steps = [("MoveAhead(0.3)", True), ("Pick(left, Mug_1)", False), ("Pick(left, Mug_1)", True), ("MoveUp(0.1)", True)]
+    whole = trajectory("a", [*steps, ("Place(left, CoffeeTable_1)", True), ("MoveUp(0.1)", True)], "Put the mug away.", True)
+    first, *others = whole.rollout.moments
+    unseen = dataclasses.replace(first, visible=("Plate_1",), known=("Plate_1", "CoffeeTable_1"))
+    rollout = dataclasses.replace(whole.rollout, moments=(unseen, *others))
+    words = taught_words(reader, [Kept(dataclasses.replace(whole, rollout=rollout), "Put the mug away.", 6, False)])
+    mug, table = id_words("Mug_1"), id_words("CoffeeTable_1")
+    assert [tuple(answer[: answer.index("do")]) for answer in words] == [
+        ("Pick", "unseen"), ("Pick", *mug), ("Place", *table), ("Place", *table)
+    ]  # fmt: skip
 
 
 def test_standing_still_is_not_learnt(reader: ProprioMLLM) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import subprocess
@@ -99,6 +100,15 @@ def test_as_many_batches_are_made_as_steps_are_taken(tmp_path: Path) -> None:
 
     run_loop(Counted(), CFG, tmp_path, 5, None, micro_batches=2)
     assert made == [CFG.batch // 2] * (2 * CFG.steps)
+
+
+def test_a_resumed_run_counts_its_own_examples_and_all_seconds(tmp_path: Path) -> None:
+    first = run_loop(Line(), dataclasses.replace(CFG, steps=8, log_every=8), tmp_path, 5, None)
+    assert (first.steps, first.examples) == (8, 8 * CFG.batch)
+    assert first.last["examples_per_s"] * first.seconds >= first.examples  # writing the checkpoint takes its time as well
+    second = run_loop(Line(), dataclasses.replace(CFG, steps=12), tmp_path, 5, None)
+    assert (second.steps, second.examples) == (12, 4 * CFG.batch)
+    assert second.seconds > first.seconds
 
 
 def test_passes_that_keep_others_company_teach_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
