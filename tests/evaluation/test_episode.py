@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -129,10 +130,11 @@ def test_invalid_replies_never_crash(session, scripted, fields, text) -> None:
 
 def test_the_trace_of_an_invalid_reply_says_what_it_was(session, scripted, fields) -> None:
     record = play(session(), scripted("Fly(Mug_1)" + "!" * 1000), fields)
-    (outcome,) = record.trace[0]["outcomes"]
+    trace: Any = record.trace
+    (outcome,) = trace[0]["outcomes"]
     assert (outcome["action"], outcome["ok"], outcome["code"], outcome["category"]) == ("", False, "InvalidOutput", "logical")
     assert outcome["message"] and len(outcome["message"]) <= 200
-    assert (record.trace[0]["step"], record.trace[0]["duration_s"]) == ("Fly(Mug_1)" + "!" * 390, 0.0)
+    assert (trace[0]["step"], trace[0]["duration_s"]) == ("Fly(Mug_1)" + "!" * 390, 0.0)
 
 
 def test_measured_numbers_are_rounded(session, scripted, fields, monkeypatch) -> None:
@@ -150,7 +152,8 @@ def test_measured_numbers_are_rounded(session, scripted, fields, monkeypatch) ->
     said = planner.step
     planner.step = lambda *seen: dataclasses.replace(said(*seen), latency_s=third / 2, usage=Usage(1, usd=third / 2))
     record = play(one, planner, fields)
-    assert record.trace[0]["duration_s"] == 0.333 and record.trace[0]["outcomes"][0]["margins"] == {"reach_m": 0.3333}
+    trace: Any = record.trace
+    assert trace[0]["duration_s"] == 0.333 and trace[0]["outcomes"][0]["margins"] == {"reach_m": 0.3333}
     assert (record.path_length_m, record.makespan_s, record.arm_utilisation) == (0.333, 0.333, 0.3333)
     assert (record.planner_s, record.planner_usd) == (0.3333, 0.33333333)
 

@@ -74,8 +74,9 @@ def test_far_points_are_held_to_ten_metres_and_trust_is_a_logarithm():
 def test_every_token_reaches_the_merged_grid(grid):
     encoder = CrossSpatialEncoder(CseConfig(source="tokens"), hidden=8, token_dim=1)
     tokens = torch.ones(1, 1, 8, 8, requires_grad=True)
-    out = encoder.spatial(GeoFeatures(tokens, torch.zeros(1, 8, 8, 3), torch.ones(1, 8, 8)), *grid, None)
-    torch.testing.assert_close(out, torch.ones(1, grid[0] * grid[1], 1))
+    rows, columns = grid
+    out = encoder.spatial(GeoFeatures(tokens, torch.zeros(1, 8, 8, 3), torch.ones(1, 8, 8)), rows, columns, None)
+    torch.testing.assert_close(out, torch.ones(1, rows * columns, 1))
     (share,) = torch.autograd.grad(out.sum(), tokens)
     assert float(share.min()) > 0.0
 

@@ -114,9 +114,9 @@ def test_a_resumed_run_counts_its_own_examples_and_all_seconds(tmp_path: Path) -
 def test_passes_that_keep_others_company_teach_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A process with fewer parts than others repeats its first one, here one without a loss."""
 
-    class Learnt(Line):
+    class Learnt(InParts):
         def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> Parts:
-            return Parts((torch.zeros(2, 3), super().batch(rng, size)))
+            return Parts((torch.zeros(2, 3), Line.batch(self, rng, size)))
 
         def loss(self, module: nn.Module, batch: Tensor, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
             self.seen += 1
