@@ -13,7 +13,7 @@ from typing import Final
 
 from interface.actions import ACTIONS, ActionKind, first_refusal
 from interface.bodies import Arm
-from interface.effects import Condition, Grasp, HoldOpen, LetGo, PutDown, Rise, Turn, Walk
+from interface.effects import Become, Condition, Grasp, HoldOpen, LetGo, PutDown, Rise, Turn, Walk
 from interface.facts import Affordances, Call, Facts, ObjectFacts, Objects
 from interface.failures import FailureCode
 from interface.observation import HistoryItem
@@ -181,7 +181,8 @@ class Belief:
         self.fails.setdefault((action.name, target), []).append(event)
         if event.code in (FailureCode.BROKE, FailureCode.OBJECT_BROKEN):
             held = None if action.arm is None else self.state.held[action.arm]
-            self.broken.add(held or target if action.spec.has_effect(PutDown) else target)
+            of_tool = any(isinstance(effect, Become) and effect.of == "tool" for effect in action.spec.effects)
+            self.broken.add(held or target if of_tool or action.spec.has_effect(PutDown) else target)
         self._failed(action, target, event.code)
 
     def _succeeded(self, action: Action, target: str) -> None:

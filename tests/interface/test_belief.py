@@ -47,6 +47,8 @@ def believed(*log: str, shutting: tuple[str, ...] = ()) -> Belief:
         (("Pick(left, Mug_1) Broke",), "Pick(right, Mug_1)", "ObjectBroken"),
         (("Pick(left, Mug_1) ok", "Place(left, Shelf_1) Broke"), "Pick(right, Mug_1)", "ObjectBroken"),
         (("Pick(left, Jug_1) ok", "Place(left, Bowl_1) Broke", "Pick(left, Cup_1) ok"), "Pour(left, Bowl_1)", None),
+        (("Pick(left, Cup_1) ok", "Fill(left, Sink_1) ObjectBroken"), "ToggleOff(right, Sink_1)", None),
+        (("Pick(left, Cup_1) ok", "Fill(left, Sink_1) ObjectBroken", "Release(left) ok"), "Pick(left, Cup_1)", "ObjectBroken"),
     ],
 )
 def test_what_is_bound_to_be_refused(log: tuple[str, ...], call: str, code: str | None) -> None:
