@@ -62,7 +62,7 @@ class Findings:
         slip_m_s: speeds of the lower sole while the base moves.
         sunk_mm: depth of the soles below the floor.
         set_downs, lasting: successful set-downs; those after which the thing, two seconds later, rests there.
-        tilts_deg: of what was set down, then, from its nearest resting attitude.
+        tilts_deg: of what was set down, then, from its nearest resting attitude; 0 in a container, where things lean.
     """
 
     task: str
@@ -230,19 +230,6 @@ def _gap(model: mujoco.MjModel, data: mujoco.MjData, ours: NDArray[np.int64], th
     return best
 
 
-def resting_tilt_deg(world: World, name: str) -> float:
-    """Angle between how an object lies and the nearest attitude in which it would rest by itself on a plane."""
-    obj = world.objects[name]
-    rotation = world.data.xmat[obj.body_id].reshape(3, 3)
-    kind = obj.type
-    if kind.parts[0].shape == "ellipsoid" and max(kind.size) < 1.5 * min(kind.size):
-        return 0.0  # a ball
-    upright = [float(np.degrees(np.arccos(np.clip(abs(rotation[2, axis]), 0.0, 1.0)))) for axis in range(3)]
-    if kind.parts[0].shape in ("cylinder", "cup", "capsule", "ellipsoid"):
-        return min(upright[2], abs(90.0 - upright[2]))
-    return min(upright)
-
-
 def measure(task_id: str, robot: str, disturb: float = 0.0, seed: int = 0) -> Findings:
     """Replays a certified plan and measures."""
     task = next(task for task in load_benchmark() if task.id == task_id)
@@ -281,7 +268,7 @@ def _set_down(session: Session, found: Findings, name: str, receptacle: str) -> 
         robot, own = world.scene.robot_bodies, set(map(int, world.objects[name].geom_ids))
         pairs = [(int(c.geom1), int(c.geom2)) for c in world.data.contact[: world.data.ncon]]
         touched = any(int(world.model.geom_bodyid[b if a in own else a]) in robot for a, b in pairs if (a in own) != (b in own))
-        tilt = resting_tilt_deg(world, name)
+        tilt = 0.0 if world.objects[receptacle].walled else world.poses.tilt_deg(name)
         there = receptacle in world.containment.parents(name)
         found.set_downs += 1
         found.lasting += there and not touched and world.poses.speed_m_s(name) < 0.02 and tilt < 10.0

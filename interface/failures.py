@@ -8,7 +8,7 @@ the planner is to notice and recover.
 Margins are signed: `reach_m` is how far the target lies beyond the arm (positive: too far), `height_m` the change of pelvis
 height that would bring it into reach (negative: move down), `mass_kg` the mass above the limit, `travel_m` the distance that
 was covered before a path was blocked, `gap_m` the distance between the fingers and what they should have touched (for
-`HandleSlipped` the share of the joint's range that is missing).
+`HandleSlipped` the share of the joint's range that is missing), `tilt_deg` how far what was put down is from standing or lying.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ FAILURES: Final[Mapping[FailureCode, FailureSpec]] = {
         _LOGIC,
         "the object did not come to rest on or in the receptacle",
         "the object did not come to rest on or in the receptacle",
-        ("gap_m",),
+        ("gap_m", "tilt_deg"),
     ),
     FailureCode.HANDLE_SLIPPED: FailureSpec(
         _LOGIC, "the hand moved but the door or drawer did not follow", "the door or drawer did not follow the hand", ("gap_m",)

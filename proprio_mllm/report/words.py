@@ -44,6 +44,7 @@ _SENTENCES: Final[Mapping[str, Callable[[str, str, float], str]]] = {
     "reach_m": _reach,
     "gap_m": _gap,
     "travel_m": lambda robot, code, value: f"{robot} could go {_metres(value)} before it was blocked",
+    "tilt_deg": lambda robot, code, value: f"it leans by {value:.0f} degrees",
     "mass_kg": lambda robot, code, value: f"{abs(value):.2f} kg {'above' if value > 0 else 'below'} what {robot} carries so",
     "missed_l": lambda robot, code, value: f"{abs(value):.2f} l went beside it",
 }

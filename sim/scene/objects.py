@@ -171,6 +171,11 @@ class ObjectInstance:
         return self.type.encloses and not self.is_open
 
     @property
+    def walled(self) -> bool:
+        """Whether what is in it may lean on its walls: what has an inside, or is a tray or a vessel."""
+        return self.type.encloses or any(part.shape in ("tray", "cup") for part in self.type.parts)
+
+    @property
     def laden_mass_kg(self) -> float:
         """Mass with the liquid that it holds; the liquid of furniture does not weigh."""
         return self.mass_kg + (self.state.fillLitres if self.movable else 0.0)

@@ -62,7 +62,7 @@ def hold(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
         if taken:
             raise SkillFailure(FailureCode.ALREADY_HELD)
         raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
-    body.world.grasps.attach(arm.value, obj.object_id)
+    body.world.grasps.attach(arm.value, obj.object_id, steady=True)
 
 
 def release(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:

@@ -50,6 +50,10 @@ _CARE: Final = 0.6
 #: A vessel with a liquid counts as upright below this tilt.
 _LEVEL_RAD: Final = float(np.radians(25.0))
 _UP: Final = np.array([0.0, 0.0, 1.0])
+#: An arm that is farther than this from where it was sent met something on the way.
+_STUCK_RAD: Final = 0.15
+#: Turns of what is put down about the vertical, rad, tried in turn.
+_TURNS: Final = (0.0, 0.35, -0.35, 0.75, -0.75, 1.2, -1.2)
 
 
 def plan_pick(body: Body, arm: Arm, obj: ObjectInstance) -> tuple[Grasp, Reach]:
@@ -104,9 +108,29 @@ def stow(body: Body, arm: Arm, ignore: tuple[str | int, ...] = ()) -> Skill:
     if held is not None and body.obj(held).state.fillLitres > 0.0:
         yield from body.arms.move(arm, [*_level_way(body, arm, held, goal), goal], speed=_CARE)
         return
-    way = route(body, arm, body.arms.commanded(arm), goal, ignore)
-    vias = way if way is not None else tuple(body.ik.vias(arm))[:1]
-    yield from body.arms.move(arm, [*vias, goal])
+    way = _way_back(body, arm, goal, ignore)
+    yield from body.arms.move(arm, [*(tuple(body.ik.vias(arm))[:1] if way is None else way), goal])
+
+
+#: Small ways of a hand that make room where it can turn nowhere: metres back along the fingers, and up.
+_ASIDE: Final = ((0.12, 0.0), (0.0, 0.12), (0.1, 0.1), (0.2, 0.0), (0.0, 0.2), (0.2, 0.1))
+
+
+def _way_back(body: Body, arm: Arm, goal: Array, ignore: tuple[str | int, ...]) -> tuple[Array, ...] | None:
+    """Postures on a way to a goal that touches nothing, the first with the hand drawn aside where there is none from here."""
+    start = body.arms.commanded(arm)
+    way = route(body, arm, start, goal, ignore)
+    if way is not None:
+        return way
+    position, hand = body.arms.hand_pose(arm)
+    for back_m, up_m in _ASIDE:
+        target = HandPose(position - back_m * hand[:, 0] + up_m * _UP, hand[:, 0], hand[:, 1])
+        aside = body.ik.solve(arm, target, start=start)
+        if aside.error_m > 0.03 or float(np.max(np.abs(aside.q - start))) > 1.5:
+            continue
+        if route(body, arm, start, aside.q, ignore) == () and (way := route(body, arm, aside.q, goal, ignore)) is not None:
+            return (aside.q, *way)
+    return None
 
 
 def _carry(body: Body, arm: Arm, held: str) -> Array:
@@ -283,7 +307,7 @@ def plan_place(body: Body, arm: Arm, obj: ObjectInstance, receptacle: ObjectInst
     if not spots:
         raise SkillFailure(FailureCode.RECEPTACLE_FULL)
     over_m = max(_APPROACH_PLACE_M, _rim_m(body, receptacle) - float(spots[0][2]) + _OVER_RIM_M)
-    return plan_bring(body, arm, obj, spots, (obj.object_id, receptacle.object_id), from_m=over_m)
+    return plan_bring(body, arm, obj, spots, (obj.object_id, receptacle.object_id), from_m=over_m, clear=(obj.object_id,))
 
 
 def _rim_m(body: Body, receptacle: ObjectInstance) -> float:
@@ -306,6 +330,7 @@ def plan_bring(
     above_m: float = 0.006,
     coming_from: Array = _UP,
     from_m: float = _APPROACH_PLACE_M,
+    clear: Sequence[str] | None = None,
 ) -> tuple[Array, Reach, Array]:
     """Plan to bring a held object upright to one of several spots.
 
@@ -319,6 +344,7 @@ def plan_bring(
         above_m: height of the object's lowest point above the spot.
         coming_from: (3,) unit direction from the spot back to where the last straight way starts.
         from_m: length of that way.
+        clear: ids that may be touched by a motion that is preferred, if there is one.
 
     Returns:
         The spot, the motion, and the direction in which the hand leaves.
@@ -338,6 +364,7 @@ def plan_bring(
         lowest -= float((tilt @ pose[:3, :3] @ point)[2])
     shoulder = body.posture.shoulder(arm)
     lift = np.array([0.0, 0.0, above_m - lowest])
+    ways = [(touched, extra) for touched in ((ignore,) if clear is None else (clear, ignore)) for extra in _TURNS]
 
     def search(body: Body) -> tuple[Array, Reach, Array]:
         for spot in spots:
@@ -345,10 +372,10 @@ def plan_bring(
             # keep the hand's azimuth relative to the line of sight, or turn the object a little
             now = float(np.arctan2(pointing[1], pointing[0])) if np.hypot(*pointing[:2]) > 0.15 else None
             straight = 0.0 if now is None else float(np.arctan2(sight[1], sight[0])) - now
-            for extra in (0.0, 0.35, -0.35, 0.75, -0.75):
+            for touched, extra in ways:
                 turn = _turn_z(straight + extra)
                 hand_target = HandPose(spot + lift - turn @ offset, turn @ pointing, turn @ closing)
-                reach = plan_reach(body, arm, hand_target, coming_from, from_m, ignore, pointing=0.9, closing=0.93)
+                reach = plan_reach(body, arm, hand_target, coming_from, from_m, touched, pointing=0.9, closing=0.93)
                 if reach is not None:
                     return spot, reach, -(turn @ pointing)
         raise SkillFailure(FailureCode.OBSTRUCTED)
@@ -360,7 +387,7 @@ def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     """Place: puts the held object down on a free spot of a receptacle.
 
     Raises:
-        SkillFailure: what `assess_place` refuses, PlaceMissed, or a contingency.
+        SkillFailure: what `assess_place` refuses, Obstructed when the arm meets something, PlaceMissed, or a contingency.
     """
     _, reach, away = assess_place(body, action)
     arm = action.arm
@@ -369,6 +396,9 @@ def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     outcome = outcome_draw(action)
     name = (obj.object_id,)
     yield from body.arms.move(arm, [*reach.way, reach.before])
+    if body.arms.off_rad(arm, reach.before) > _STUCK_RAD:
+        yield from stow(body, arm, name)
+        raise SkillFailure(FailureCode.OBSTRUCTED)
     if outcome in ("nothing", "spilled"):
         if outcome == "spilled":
             body.world.liquids.spill(obj)
@@ -388,15 +418,49 @@ def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     back = body.ik.solve(arm, HandPose(position + 0.09 * away, hand[:, 0], hand[:, 1]), start=body.arms.commanded(arm))
     yield from body.arms.move(arm, [back.q if back.error_m < 0.03 else reach.before])
     yield from stow(body, arm)
-    for _ in range(int(1.0 / CONTROL_DT_S)):
-        if body.world.poses.speed_m_s(obj.object_id) < 0.02:
+    if outcome == "broken":
+        yield from at_rest(body, obj)
+        raise SkillFailure(FailureCode.BROKE, contingency=outcome)
+    yield from set_down(body, obj, receptacle)
+
+
+#: Speed of what is at rest, for how long it has to keep to it, and how long that is waited for.
+_REST_M_S: Final = 0.02
+_REST_S: Final = 0.6
+_PATIENCE_S: Final = 2.0
+#: What is farther than this from an attitude in which it rests by itself leans on something, degrees; than that, on a part of
+#: the robot that touches it.
+_LEANS_DEG: Final = 10.0
+_TOUCHED_DEG: Final = 3.0
+
+
+def at_rest(body: Body, obj: ObjectInstance) -> Skill:
+    """Waits until an object has been at rest for a while, or has not come to rest in time."""
+    still = 0
+    for _ in range(int(_PATIENCE_S / CONTROL_DT_S)):
+        still = still + 1 if body.world.poses.speed_m_s(obj.object_id) < _REST_M_S else 0
+        if still >= _REST_S / CONTROL_DT_S:
             break
         yield
-    if outcome == "broken":
-        raise SkillFailure(FailureCode.BROKE, contingency=outcome)
-    if receptacle.object_id not in body.world.containment.parents(obj.object_id):
-        gap = float(np.linalg.norm(body.world.poses.center(obj.object_id) - body.world.poses.center(receptacle.object_id)))
-        raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})
+
+
+def set_down(body: Body, obj: ObjectInstance, receptacle: ObjectInstance) -> Skill:
+    """Waits until what was let go of is at rest, and looks whether it is set down.
+
+    It is when the receptacle carries it and it leans on nothing: not on the robot, and elsewhere in containers alone.
+
+    Raises:
+        SkillFailure: PlaceMissed.
+    """
+    yield from at_rest(body, obj)
+    world = body.world
+    tilt_deg = world.poses.tilt_deg(obj.object_id)
+    leans = (tilt_deg > _LEANS_DEG and not receptacle.walled) or (tilt_deg > _TOUCHED_DEG and body.contacts.touches_robot(obj))
+    carried = receptacle.object_id in world.containment.parents(obj.object_id)
+    moves = world.poses.speed_m_s(obj.object_id) >= _REST_M_S
+    if not carried or moves or leans:
+        gap = float(np.linalg.norm(world.poses.center(obj.object_id) - world.poses.center(receptacle.object_id)))
+        raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap, "tilt_deg": tilt_deg})
 
 
 @cached_plan

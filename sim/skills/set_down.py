@@ -26,12 +26,12 @@ from sim.skills.body.body import Body
 from sim.skills.body.clearance import TOUCH_M
 from sim.skills.body.ik import BothGoal
 from sim.skills.failures import SkillFailure, require
-from sim.skills.manipulate import OutcomeDraw, upright
+from sim.skills.manipulate import OutcomeDraw, set_down, upright
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import diagnose
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import CONTROL_DT_S, Skill, wait
-from sim.skills.two_arm import BOTH_TOLERANCE_M, against_sag, hands_m
+from sim.skills.runner import Skill, wait
+from sim.skills.two_arm import BOTH_TOLERANCE_M, against_sag, hands_m, way_round
 
 Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
@@ -260,11 +260,8 @@ def place_both(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
         hand_targets[arm] = HandPose(position + sign * 0.09 * outward + 0.01 * _UP, hand[:, 0], hand[:, 1])
     apart = body.ik.solve_both(hand_targets, body.arms.commanded_both())
     yield from body.arms.move_both([apart], speed=0.6)
-    yield from body.arms.stow_both()
-    for _ in range(int(0.6 / CONTROL_DT_S)):
-        if body.world.poses.speed_m_s(obj.object_id) < 0.02:
-            break
-        yield
-    if receptacle.object_id not in body.world.containment.parents(obj.object_id):
-        gap = float(np.linalg.norm(body.world.poses.center(obj.object_id) - body.world.poses.center(receptacle.object_id)))
-        raise SkillFailure(FailureCode.PLACE_MISSED, {"gap_m": gap})
+    ready = body.arms.ready_both()
+    way = way_round(body, ready)  # past the load, not across it; an arm that would press on it stays there
+    home = {arm: q if body.probe.free(arm, [q], opening=1.0) else way.arms[arm] for arm, q in ready.arms.items()}
+    yield from body.arms.move_both([way, BothGoal(home, ready.waist, 0.0)])
+    yield from set_down(body, obj, receptacle)

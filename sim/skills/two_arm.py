@@ -113,7 +113,7 @@ def assess_lift(body: Body, action: Action) -> BothReach:
         for arm in Arm:
             if not (body.probe.free(arm, [before.arms[arm]], opening=1.0) and body.probe.free(arm, [at.arms[arm]], name, 1.0)):
                 raise SkillFailure(FailureCode.OBSTRUCTED)
-        return BothReach(_way(body, before), before, at)
+        return BothReach(way_round(body, before), before, at)
 
     try:
         return search(body)
@@ -121,7 +121,7 @@ def assess_lift(body: Body, action: Action) -> BothReach:
         raise diagnose(body, {arm: point for arm, (point, _) in sides.items()}, search) from None
 
 
-def _way(body: Body, goal: BothGoal) -> BothGoal:
+def way_round(body: Body, goal: BothGoal) -> BothGoal:
     """A posture of both arms half way to a goal, by a detour where the straight way meets something."""
     middle: dict[Arm, Array] = {}
     for arm in Arm:

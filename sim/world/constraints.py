@@ -18,9 +18,17 @@ from numpy.typing import NDArray
 from sim.scene.compiler import ARM_BITS, HELD_BITS, HELD_DOOR_BITS, LIMB_BIT, MOVABLE_BITS, STATIC_BITS
 
 _SEPARATION_M = 0.001
+#: Of a tree that has just moved.
+_AWAKE = -(1 + mujoco.mjMINAWAKE)
 #: Time constants with which a grasp takes up an error of the hand.
 _FIRM_S = 0.01
 _GENTLE_S = 0.036
+#: Impedance of a weld; of one that steadies, and of both where two hands hold one thing: rigid ones would fight each other.
+_RIGID = (0.99, 0.999, 0.001)
+_SOFT = (0.9, 0.95, 0.001)
+#: A weld that is off by more than this holds no longer.
+_TORN_M = 0.05
+_TORN_RAD = float(np.radians(30.0))
 
 
 @dataclass(slots=True)
@@ -84,6 +92,7 @@ class GraspConstraints:
         lids: Sequence[int] = (),
         point: NDArray[np.float64] | None = None,
         gentle: bool = False,
+        steady: bool = False,
     ) -> None:
         """Ties a body to a hand in their present relative pose.
 
@@ -94,6 +103,7 @@ class GraspConstraints:
             lids: bodies hinged to it that are carried along: they do not touch the hands either.
             point: (3,) where the ball joint is, world frame; the grasp site when None.
             gentle: whether the fingers give: a lid would drag a light object along else, when the hand errs by millimetres.
+            steady: whether it stays on what carries it, where a rigid weld would tilt it as the hand sways.
         """
         model, data, hand = self.model, self.data, self.hand_bodies[arm]
         eq = self._eq(arm, "weld" if rigid else "ball")
@@ -114,11 +124,29 @@ class GraspConstraints:
             values[3:6] = r2.T @ (point - data.xpos[body])
         model.eq_data[eq] = values
         model.eq_solref[eq, 0] = _GENTLE_S if gentle else _FIRM_S
+        model.eq_solimp[eq, :3] = _RIGID if rigid and not steady else _SOFT
+        for other in self.hand_bodies:
+            if other != arm and rigid and self.held_body(other) == body:
+                model.eq_solimp[[eq, self._eq(other, "weld")], :3] = _SOFT
         data.eq_active[eq] = 1
         others = sum(bit for other, bit in ARM_BITS.items() if other != arm)
         for moved in (body, *lids):
             self._set_bits(moved, HELD_BITS if rigid else (HELD_DOOR_BITS[0], others))
         self.released = [pair for pair in self.released if pair[1] not in (body, *lids)]
+
+    def torn(self, arm: str) -> bool:
+        """Whether what an arm holds rigidly is no longer where it was taken."""
+        eq = self._eq(arm, "weld")
+        if not self.data.eq_active[eq]:
+            return False
+        model, data = self.model, self.data
+        hand, body, values = int(model.eq_obj1id[eq]), int(model.eq_obj2id[eq]), model.eq_data[eq]
+        place, turn = np.zeros(3), np.zeros(4)
+        mujoco.mju_rotVecQuat(place, values[3:6], data.xquat[hand])
+        mujoco.mju_mulQuat(turn, data.xquat[hand], values[6:10])
+        error_m = float(np.linalg.norm(data.xpos[hand] + place - data.xpos[body]))
+        half = min(1.0, abs(float(turn @ data.xquat[body])))
+        return error_m > _TORN_M or 2.0 * float(np.arccos(half)) > _TORN_RAD
 
     def give_way(self, lid: int, below: int | None) -> None:
         """Ends the contacts of a lid, and of the free body below it, with both hands."""
@@ -130,6 +158,8 @@ class GraspConstraints:
         """Releases a body and the lids hinged to it; `last` means that no other hand still holds it."""
         for kind in ("weld", "ball"):
             self.data.eq_active[self._eq(arm, kind)] = 0
+        for body in bodies:  # what a still hand held has long been slow enough to sleep, and would do so in the air
+            self.data.tree_asleep[self.model.body_treeid[body]] = _AWAKE
         if last:
             self.released += [(arm, body) for body in bodies]
 

@@ -45,7 +45,12 @@ class Grasps:
         return next((name for name, item in self._scene.objects.items() if arm in item.held_by), None)
 
     def attach(
-        self, arm: str, object_id: str, part: MovingPart | None = None, point: NDArray[np.float64] | None = None
+        self,
+        arm: str,
+        object_id: str,
+        part: MovingPart | None = None,
+        point: NDArray[np.float64] | None = None,
+        steady: bool = False,
     ) -> None:
         """Ties an object to a hand as it is now: free objects rigidly, doors, drawers and lids by a ball joint.
 
@@ -56,6 +61,7 @@ class Grasps:
             object_id: the object.
             part: its door, drawer or lid that is taken; None takes a free object as a whole, and the nearest door of furniture.
             point: (3,) where the ball joint is, world frame; the grasp site when None.
+            steady: whether a free object is steadied where it is instead of being taken.
 
         Raises:
             WorldError: when the arm holds something, or the object is furniture without a door.
@@ -66,7 +72,8 @@ class Grasps:
         if not item.movable and not item.moving:
             raise WorldError(f"{object_id} is furniture and cannot be held")
         if item.movable and part is None:
-            self.constraints.attach(arm, item.body_id, rigid=True, lids=item.body_ids[1:])
+            self.constraints.attach(arm, item.body_id, rigid=True, lids=item.body_ids[1:], steady=steady)
+            self._servos.hold_hand(arm)
         else:
             body = self._nearest_door(arm, item) if part is None else part.body_id
             gentle = item.movable and item.mass_kg < _LIGHT_KG
@@ -94,7 +101,10 @@ class Grasps:
         return name
 
     def settle(self) -> None:
-        """Restores the contacts between the hands and released objects once they are clear of each other."""
+        """Ends grasps that were torn, and restores contacts of the hands with released objects once they are clear of them."""
+        for arm in SIDES:
+            if self.constraints.torn(arm):
+                self.detach(arm)
         if self.constraints.released:
             self.constraints.settle_released(self._movable_body)
 

@@ -41,6 +41,17 @@ class ObjectPoses:
         axis = -self._scene.data.xmat[self._scene.object(object_id).body_id].reshape(3, 3)[:2, 1]
         return axis / max(float(np.linalg.norm(axis)), 1e-9)
 
+    def tilt_deg(self, object_id: str) -> float:
+        """Angle between how an object lies and the nearest attitude in which it would rest by itself on a plane."""
+        item = self._scene.object(object_id)
+        shape, up = item.type.parts[0].shape, self._scene.data.xmat[item.body_id].reshape(3, 3)[2]
+        if shape == "ellipsoid" and max(item.type.size) < 1.5 * min(item.type.size):
+            return 0.0  # a ball
+        off = np.degrees(np.arccos(np.clip(np.abs(up), 0.0, 1.0)))  # of each axis from the vertical
+        if shape in ("cylinder", "cup", "capsule", "ellipsoid"):
+            return float(min(off[2], 90.0 - off[2]))
+        return float(off.min())
+
     def grips(self, object_id: str, kind: str = "single") -> NDArray[np.float64]:
         """(N, 3) points where hands hold it: one for `single`, two (at +x and -x of the object) for `double`."""
         item = self._scene.object(object_id)

@@ -86,6 +86,11 @@ class Servos:
         values = np.asarray(spec.hand_closed) + share * (np.asarray(spec.hand_open) - np.asarray(spec.hand_closed))
         self.set_joint_targets(dict(zip(spec.hand_joints, map(float, values), strict=True)))
 
+    def hold_hand(self, arm: str) -> None:
+        """Commands a hand's joints to where they are: fingers at rest on something press on no further."""
+        positions = self.joint_positions()
+        self.set_joint_targets({name: positions[name] for name in self._scene.the_robot().arms[arm].hand_joints})
+
     def hand_opening(self, arm: str) -> float:
         """Measured opening of a hand, 0 closed to 1 open."""
         self._scene.the_robot()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from sim.skills.body.joints import JointMap
 from sim.world.world import World
 
 Array = NDArray[np.float64]
+_TOUCH_M: Final = 0.001
 
 
 class Contacts:
@@ -50,6 +53,19 @@ class Contacts:
             other = b if a in mine else a if b in mine else -1
             if other >= 0 and (owner[other] >= 0 or other == 0) and abs(float(contact.frame[2])) > 0.6 and contact.dist < 0.0:
                 return True
+        return False
+
+    def touches_robot(self, obj: ObjectInstance) -> bool:
+        """Whether a part of the robot is within a millimetre of an object; asleep, it has no contacts that would tell."""
+        model, data = self._world.model, self._world.data
+        own = [geom for geom in obj.geom_ids if model.geom_contype[geom] > 0]
+        for mine in np.flatnonzero((self._mine > 0) & (model.geom_contype > 0)):
+            for geom in own:
+                near = model.geom_rbound[mine] + model.geom_rbound[geom] + _TOUCH_M
+                if np.linalg.norm(data.geom_xpos[mine] - data.geom_xpos[geom]) > near:
+                    continue
+                if mujoco.mj_geomDistance(model, data, int(mine), int(geom), _TOUCH_M, None) < _TOUCH_M:
+                    return True
         return False
 
     def _pressed(self) -> tuple[float, bool]:

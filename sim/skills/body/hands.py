@@ -34,6 +34,10 @@ class Hands:
                 found[Arm(arm)] = name
         return found
 
+    def place(self, object_id: str) -> Array:
+        """(3,) centre of an object, world frame."""
+        return self._world.poses.center(object_id)
+
     @property
     def lifted(self) -> str | None:
         """The object that both hands hold together."""

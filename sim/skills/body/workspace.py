@@ -39,15 +39,16 @@ class Workspace:
         return 0.55 * reach + leaning, 0.8 * reach + leaning
 
     def free_spots(self, obj: ObjectInstance, receptacle: ObjectInstance, arm: Arm | None, count: int = 4) -> list[Array]:
-        """Free spots (3,) on a receptacle for an object, the ones the arm reaches most easily first."""
-        easy = self._easy_point(arm)
+        """Free spots (3,) on a receptacle for an object: those below its spout, or that the arm reaches most easily, first."""
+        spout = self._world.liquids.spout(receptacle)
+        easy = self._easy_point(arm) if spout is None else spout
         spots: list[Array] = []
         # What two hands carry is held with its long side across: its narrow side may stand a little over the edge.
         narrow = 0.5 * OVERHANG_SHARE * float(np.min(obj.local_max[:2] - obj.local_min[:2]))
         radius = obj.footprint_radius_m if arm is not None else narrow
         for gap in (0.04, 0.01):
             for dx, dy in (
-                (0.0, 0.0),
+                *((0.0, 0.0), *(((0.04, 0.0), (0.0, 0.04), (0.0, -0.04), (-0.04, 0.0)) if spout is not None else ())),
                 (0.0, 0.12),
                 (0.0, -0.12),
                 (0.1, 0.0),

@@ -90,12 +90,17 @@ def compared(robot: str, task: Task) -> int:
             assert not found, (task.id, steps, session.history[-1:], found)
             if session.finished:
                 return steps
+            held = set(filter(None, session.body.hands.held.values()))
             _, feedback = session.step(expert.next_step())
             if not feedback.success:  # what a failure leaves behind no table says
                 return steps
+            let_go = held - set(session.body.hands.held.values())
+            fallen = [session.world.containment.parents(name)[:1] for name in let_go if session.world.objects[name].movable]
+            if () in fallen:  # to the floor, which no table says
+                return steps
             for outcome in feedback.outcomes:
                 left.look(outcome.action, text)
-                text.succeed(outcome.action, "")
+                text.succeed(outcome.action, next((place for (place,) in fallen), ""))
             steps += 1
     finally:
         session.close()
