@@ -57,7 +57,7 @@ check: $(STAMP)
 	$(BIN)/lint-imports
 	$(BIN)/python tools/structure.py --check
 
-# Which bugs, put in one by one, the tests notice; two hours, and it goes on where it was killed.
+# Which bugs, put in one by one, the tests notice; an hour of a core, and it goes on where it was killed.
 mutants: $(STAMP)
 	$(BIN)/python benchmarks/mutants.py
 

@@ -28,8 +28,8 @@ from configs.validate import ConfigError, allowed_values
 CONFIG_DIR = Path(__file__).resolve().parent
 #: What Hydra raises when overrides do not compose.
 COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException)
-#: Groups whose fields may be set although the group's file leaves them at the schema's defaults.
-_OPEN = ("backend.", "planner.")
+#: A field of a part: it may be set although the part's file leaves it at the schema's default.
+_FIELD = re.compile(r"(?!hydra\.)\w+(\.\w+)+=")
 
 
 def groups(folder: Path = CONFIG_DIR) -> dict[str, tuple[str, ...]]:
@@ -59,7 +59,7 @@ def register(help_text: str = "") -> None:
 
 
 def open_fields(overrides: Sequence[str]) -> list[str]:
-    """Overrides that may set what a group's file leaves at its default; the schema refuses fields that do not exist.
+    """Overrides that may set what a file leaves at its default; the schema refuses fields that do not exist.
 
     Raises:
         ConfigError: on an override without a key.
@@ -67,7 +67,7 @@ def open_fields(overrides: Sequence[str]) -> list[str]:
     for override in overrides:
         if not override.partition("=")[0].strip("+~"):
             raise ConfigError(f"override {override!r}: expected key=value")
-    return [f"++{override}" if override.startswith(_OPEN) else override for override in overrides]
+    return [f"++{override}" if _FIELD.match(override) else override for override in overrides]
 
 
 def compose(root: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
@@ -135,7 +135,7 @@ def _unknown_key(root: str, overrides: Sequence[str]) -> str:
         config = hydra_compose(config_name=root)
     for override in overrides:
         key = override.partition("=")[0].lstrip("+~")
-        if key in groups() or key.startswith((*_OPEN, "hydra")):
+        if key in groups() or _FIELD.match(f"{key}=") or key.startswith("hydra"):
             continue
         node: Any = config
         path: list[str] = []

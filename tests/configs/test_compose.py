@@ -117,3 +117,22 @@ def test_wrong_entries_stop_at_once(root: str, override: str, message: str) -> N
 def test_unknown_root() -> None:
     with pytest.raises(ConfigError, match="no root config 'sleep'; allowed: eval, train"):
         compose("sleep")
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "tokenizer.checkpoint_every=7",
+        "alignment.joint.minutes=3",
+        "selu.rollouts.workers=64",
+        "practice.workers=1",
+        "logger.project=mine",
+        "model.point_map.size=64",
+    ],
+)
+def test_fields_that_a_file_leaves_at_their_defaults_may_be_set(override: str) -> None:
+    name, _, value = override.partition("=")
+    field: object = build(TrainConfig, compose("train", [override]))
+    for part in name.split("."):
+        field = getattr(field, part)
+    assert str(field) in (value, f"{value}.0")
