@@ -21,6 +21,7 @@ MODEL_FIELDS: Final = (
     "eq_obj2id",
     "eq_data",
     "eq_solref",
+    "eq_solimp",
     "geom_contype",
     "geom_conaffinity",
     "geom_pos",

@@ -71,6 +71,16 @@ def test_a_grasp_that_is_torn_is_none(carrying: Session) -> None:
     assert world.grasps.held("right") is None and not item.held_by
 
 
+def test_a_snapshot_knows_how_firm_a_grasp_is(carrying: Session) -> None:
+    world = carrying.world
+    before, kept = world.model.eq_solimp.copy(), world.save()
+    world.grasps.detach("right")
+    world.grasps.attach("right", "Mug_1", steady=True)
+    assert not np.array_equal(world.model.eq_solimp, before)
+    world.restore(kept)
+    assert np.array_equal(world.model.eq_solimp, before)
+
+
 def test_fingers_rest_on_what_they_hold(carrying: Session) -> None:
     servos, spec = carrying.world.servos, carrying.world.scene.the_robot().arms["right"]
     told, measured = servos.joint_targets(), servos.joint_positions()
