@@ -32,19 +32,20 @@ class LimitedServer(ThreadingHTTPServer):
 
     def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
         super().__init__(address, handler)
-        self._free = threading.BoundedSemaphore(self.connections)
+        self._served: set[Any] = set()
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Hands a connection to a thread."""
-        if not self._free.acquire(blocking=False):
+        if len(self._served) >= self.connections:
             with contextlib.suppress(OSError):
                 request.sendall(_FULL)
             self.shutdown_request(request)
             return
+        self._served.add(request)
         try:
             super().process_request(request, client_address)
-        except BaseException:
-            self._free.release()
+        except BaseException:  # Ctrl-C may come when the thread already runs, or has ended
+            self._served.discard(request)
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
@@ -52,7 +53,7 @@ class LimitedServer(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._free.release()
+            self._served.discard(request)
 
 
 class LimitedHandler(BaseHTTPRequestHandler):

@@ -72,7 +72,7 @@ def test_fifty_at_once_are_answered(server: LimitedServer, monkeypatch: pytest.M
 def test_who_comes_when_all_are_taken_is_told_so_and_places_come_back(
     server: LimitedServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server, "_free", threading.BoundedSemaphore(2))
+    monkeypatch.setattr(server, "connections", 2)
     with ThreadPoolExecutor(2) as pool:
         waiting = [pool.submit(ask, server, "/wait") for _ in range(2)]
         time.sleep(0.2)
@@ -81,9 +81,26 @@ def test_who_comes_when_all_are_taken_is_told_so_and_places_come_back(
         _Handler.gate.set()
         assert [one.result() for one in waiting] == [b"ok"] * 2
     deadline = time.monotonic() + 5.0
-    while server._free._value < 2 and time.monotonic() < deadline:
+    while server._served and time.monotonic() < deadline:
         time.sleep(0.05)
     assert ask(server) == b"ok"
+
+
+def test_an_interrupt_while_a_connection_is_handed_over_ends_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Interrupted(threading.Thread):
+        def start(self) -> None:
+            super().start()
+            self.join(20.0)  # the connection is served before the signal's exception is raised
+            raise KeyboardInterrupt
+
+    with LimitedServer(("127.0.0.1", 0), _Handler) as server:
+        server.timeout = 20.0
+        with connect(server) as client:
+            client.sendall(b"GET / HTTP/1.1\r\nConnection: close\r\n\r\n")
+            with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+                patch.setattr(threading, "Thread", Interrupted)
+                server.handle_request()
+        assert not server._served
 
 
 @pytest.mark.parametrize("start", [b"", b"GET / HTTP/1.1\r\n", b"POST / HTTP/1.1\r\nContent-Length: 1000\r\n\r\n"])
