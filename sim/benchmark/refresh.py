@@ -78,25 +78,28 @@ def refresh(
         RuntimeError: when no seed stands in for a task; the message names it.
     """
     chosen = [task for task in tasks if family in (None, task.family)]
-    result = dict(zip((task.id for task in chosen), solve_again(chosen, certificates, robots, workers, kept), strict=True))
-    proofs = {task.id: [proof for proof in certificates if proof.task == task.id] for task in tasks}
-    standing = [task for task in tasks if not isinstance(result.get(task.id), str)]
-    made: list[Task] = []
-    replaced: list[str] = []
-    for task in tasks:
-        now = result.get(task.id)
-        if now is None:
-            made.append(task)
-            continue
-        if isinstance(now, str):
-            why, now = now, _replacement(task, [*standing, *made])
-            _keep(kept, task, robots, now)
-            replaced.append(f"{task.id}: {why}; {now[0].id} stands in")
-        elif now[0].id != task.id:  # found before the refresh was stopped
-            replaced.append(f"{task.id}: {now[0].id} stands in")
-        made.append(now[0])
-        proofs[now[0].id] = list(now[1])
-    return made, [proof for task in made for proof in proofs[task.id]], replaced
+    again = dict(zip((task.id for task in chosen), solve_again(chosen, certificates, robots, workers, kept), strict=True))
+    solved = {name: now for name, now in again.items() if not isinstance(now, str)}
+    refused = [task for task in chosen if task.id not in solved]
+    standing = [solved[task.id][0] if task.id in solved else task for task in tasks if task not in refused]
+    with worker_pool(workers) as pool:
+        found = pool.map(_stand_in, refused, [tuple(standing)] * len(refused))
+        for task, drawn in tqdm(zip(refused, found, strict=True), total=len(refused), desc="stand-ins", unit="task"):
+            if drawn is not None and not _new(drawn[0], standing):  # it stands in for another one already
+                drawn = _stand_in(task, standing)
+            if drawn is None:
+                raise RuntimeError(f"{task.id} is solved no more, and no seed of {task.family} stands in for it")
+            _keep(kept, task, robots, drawn)
+            standing.append(drawn[0])
+            solved[task.id] = drawn
+    old = {task.id: (task, tuple(proof for proof in certificates if proof.task == task.id)) for task in tasks}
+    now = [solved.get(task.id, old[task.id]) for task in tasks]
+    replaced = [
+        f"{task.id}: {why if isinstance(why := again[task.id], str) else 'solved no more'}; {made.id} stands in"
+        for task, (made, _) in zip(tasks, now, strict=True)
+        if made.id != task.id  # perhaps found before the refresh was stopped
+    ]
+    return [made for made, _ in now], [proof for _, proofs in now for proof in proofs], replaced
 
 
 def drift(task: Task, old: Sequence[Certificate], now: Solved) -> Iterator[str]:
@@ -121,19 +124,24 @@ def drift(task: Task, old: Sequence[Certificate], now: Solved) -> Iterator[str]:
                 yield f"{task.id} on {before.robot}: {arm} arm alone {again} steps, certified {steps}"
 
 
-def _replacement(task: Task, others: Sequence[Task]) -> tuple[Task, tuple[Certificate, ...]]:
-    used = {other.seed for other in others} | {task.seed}
+def _stand_in(task: Task, others: Sequence[Task]) -> tuple[Task, tuple[Certificate, ...]] | None:
+    """The first draw that may take a task's place beside others, with its certificates."""
     for room, seed in more_seeds(task):
-        if seed in used:
+        if seed == task.seed:
             continue
-        slot = [other for other in others if (other.family, other.room) == (task.family, room)]
         try:
             fresh = sample_task(seed, room, task.family, "benchmark")
-            if fits(fresh, slot, len(slot) + 1):
+            if _new(fresh, others):
                 return certified(fresh)
         except (ValueError, WorldError):
             continue
-    raise RuntimeError(f"{task.id} is solved no more, and no seed of {task.family} stands in for it")
+    return None
+
+
+def _new(task: Task, others: Sequence[Task]) -> bool:
+    """Whether a task is none of the others and makes them more varied."""
+    slot = [other for other in others if (other.family, other.room) == (task.family, task.room)]
+    return task.seed not in {other.seed for other in others} and fits(task, slot, len(slot) + 1)
 
 
 def _solved(job: _Job) -> Solved:

@@ -7,9 +7,9 @@ Furniture is static, with joints for doors and drawers; movable objects have fre
 a body (`World.attach`). Paper: the DualTHOR scenes; balance control and cloth-like or liquid bodies are left out.
 
 Collision bits (`contype`/`conaffinity`), so that only pairs that matter are tested: static 1/0, movable 2/23, hands and
-forearms 4/3 (set in the robot's MJCF; 36/3 the left ones, 68/3 the right ones), held object 8/27, held door or drawer 16/64 or
-16/32. Static geometry, doors, trunk and legs never meet each other; a held object does not meet the hands, a held door does not
-meet the hand that holds it.
+forearms 4/3 (set in the robot's MJCF; 36/3 the left ones, 68/3 the right ones), held object 8/155, held door or drawer 16/64 or
+16/32, trunk, head, upper arms and legs 128/0. Static geometry, doors, trunk and legs never meet each other; a held object does
+not meet hands and forearms, a held door does not meet the hand that holds it.
 """
 
 from __future__ import annotations
@@ -34,16 +34,19 @@ PUDDLES: Final = 6
 TIMESTEP_S: Final = 0.005
 #: Version of the physics, raised with each change after which the same plan may end otherwise (models, contacts, solver,
 #: motions of skills). Certificates, runs and tables say with which one they were made. 1: sparse Jacobians where MuJoCo chooses
-#: them; 2: dense ones; 3: grasps that hold, fingers at rest, loads that do not fly, set-downs that last.
-PHYSICS: Final = 3
+#: them; 2: dense ones; 3: grasps that hold, fingers at rest, loads that do not fly, set-downs that last; 4: feet that stand,
+#: decisions of two ticks, what is held meets the robot's own body, goals read when things have come to rest.
+PHYSICS: Final = 4
 BASE_JOINTS: Final = ("base_x", "base_y", "base_z", "base_yaw", "base_pitch")
 STATIC_BITS: Final = (1, 0)
 MOVABLE_BITS: Final = (2, 23)
-HELD_BITS: Final = (8, 27)
+HELD_BITS: Final = (8, 155)
 HELD_DOOR_BITS: Final = (16, 0)
 #: Bit that forearm and hand of each arm have besides, so that a door in one hand meets the other arm.
 ARM_BITS: Final = {"left": 32, "right": 64}
 LIMB_BIT: Final = 4
+#: Of trunk, head, upper arms and legs, which what is held alone meets.
+OWN_BIT: Final = 128
 
 #: Position gain and damping ratio of the base servos, 20 ms to 30 ms behind their targets. Arms that reach out add inertia to
 #: the turns, so these are damped more.

@@ -13,7 +13,7 @@ import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -38,6 +38,9 @@ from sim.skills.runner import CONTROL_DT_S, Skill, run_skills
 from sim.world.facts import world_facts
 from sim.world.snapshot import WorldSnapshot
 from sim.world.world import World
+
+#: How long things may come to rest before goals are read that seem to hold.
+_SETTLE_S: Final = 1.0
 
 
 class GoalLike(Protocol):
@@ -251,6 +254,8 @@ class Session:
             feedback = Feedback(outcomes, 0.0)
         else:
             feedback = self._run(step, diagnose)
+        if self._ended or self.succeeded:
+            self._settle(step.to_text())
         arms = sum(2 if a.spec.kind is ActionKind.TWO_ARM else int(a.spec.kind is ActionKind.ARM) for a in step.actions)
         self.stats = dataclasses.replace(
             self.stats,
@@ -261,6 +266,13 @@ class Session:
         )
         self._history.append(HistoryItem(step.to_text(), feedback.to_text()))
         return feedback
+
+    def _settle(self, text: str) -> None:
+        """Lets things come to rest before the goals are read: what is about to fall is not where it should be."""
+        for _ in range(round(_SETTLE_S / CONTROL_DT_S)):
+            self.world.advance(CONTROL_DT_S)
+            for watch in self.watchers:
+                watch(self.world, text)
 
     def _run(self, step: PlanStep, diagnose: bool) -> Feedback:
         known = frozenset(self.known_objects)

@@ -34,7 +34,8 @@ def leg_motion(feet: Footsteps, pelvis_height_m: float, soles_m: Array, way: Arr
         soles_m: (2, 2) x and y of the left and the right sole of the standing robot, pelvis heading frame.
         way: (T, 3) commanded x, y (m) and yaw (rad, not wrapped), the present pose first.
     """
-    moved = np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1) / feet.longest_m(pelvis_height_m)
+    longest_m = 2.0 * np.array(feet.reach_m(round(pelvis_height_m, 3)))  # ahead, aside
+    moved = np.linalg.norm(_in_heading(np.diff(way[:, :2], axis=0), way[1:, 2]) / longest_m, axis=1)
     turned = np.abs(np.diff(way[:, 2])) / _TURN_RAD
     progress = np.concatenate([[0.0], np.cumsum(np.maximum(moved, turned))])  # (T,) in longest steps
     total = float(progress[-1])
@@ -63,7 +64,7 @@ def leg_motion(feet: Footsteps, pelvis_height_m: float, soles_m: Array, way: Arr
             if foot == swinging:
                 poses = poses + smooth[:, None] * (landing - places[foot])
                 shifts[ticks, foot, 2] = lift * 4.0 * share * (1.0 - share)
-            shifts[ticks, foot, :2] = _in_heading(way[ticks], poses) - soles_m[foot]
+            shifts[ticks, foot, :2] = _in_heading(poses[:, :2] - way[ticks, :2], way[ticks, 2]) - soles_m[foot]
             shifts[ticks, foot, 3] = poses[:, 2] - way[ticks, 2]
         places[swinging] = landing
     return feet.joints(pelvis_height_m, shifts)
@@ -75,7 +76,7 @@ def _foothold(base: Array, sole_m: Array) -> Array:
     return np.array([base[0] + c * sole_m[0] - s * sole_m[1], base[1] + s * sole_m[0] + c * sole_m[1], base[2]])
 
 
-def _in_heading(bases: Array, poses: Array) -> Array:
-    """(T, 2) positions of poses (T, 3) in the heading frames of bases (T, 3)."""
-    delta, c, s = poses[:, :2] - bases[:, :2], np.cos(bases[:, 2]), np.sin(bases[:, 2])
-    return np.stack([c * delta[:, 0] + s * delta[:, 1], c * delta[:, 1] - s * delta[:, 0]], axis=1)
+def _in_heading(vectors: Array, yaws_rad: Array) -> Array:
+    """(T, 2) vectors in heading frames (T,)."""
+    c, s = np.cos(yaws_rad), np.sin(yaws_rad)
+    return np.stack([c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]], axis=1)

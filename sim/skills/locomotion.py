@@ -23,12 +23,14 @@ from interface.steps import Action
 from sim.skills.body.body import Body
 from sim.skills.failures import SkillFailure
 from sim.skills.navigation import NavigationMap, Stance, wrap_angle
-from sim.skills.runner import CONTROL_DT_S, Skill
+from sim.skills.runner import CONTROL_DT_S, Skill, TwoTicks
 from sim.skills.trajectory import min_jerk, plan, plan_polyline
 
 WALK_SPEED_M_S: Final = 0.9
 WALK_ACCELERATION_M_S2: Final = 2.0
 TURN_SPEED_RAD_S: Final = 2.2
+#: While walking with something in a hand, which is ahead of the base and would be flung round.
+LADEN_TURN_SPEED_RAD_S: Final = 0.8
 TURN_ACCELERATION_RAD_S2: Final = 5.0
 HEIGHT_SPEED_M_S: Final = 0.35
 HEIGHT_ACCELERATION_M_S2: Final = 1.0
@@ -70,6 +72,7 @@ def _walk(body: Body, path: NDArray[np.float64], along: bool, limits: NDArray[np
     """Follows a polyline; `along` turns the heading into the direction of travel at a bounded rate."""
     way = plan_polyline(path, WALK_SPEED_M_S, WALK_ACCELERATION_M_S2)
     yaw = body.posture.stance().yaw_rad
+    turn = LADEN_TURN_SPEED_RAD_S if any(body.hands.held.values()) else TURN_SPEED_RAD_S
     poses = []
     for time_s in _ticks(way.duration_s):
         x, y = way.at(time_s)
@@ -77,7 +80,7 @@ def _walk(body: Body, path: NDArray[np.float64], along: bool, limits: NDArray[np
             ahead = way.at(time_s + 0.25) - (x, y)
             if float(np.hypot(*ahead)) > 1e-3:
                 error = wrap_angle(float(np.arctan2(ahead[1], ahead[0])) - yaw)
-                yaw += float(np.clip(4.0 * error, -TURN_SPEED_RAD_S, TURN_SPEED_RAD_S)) * CONTROL_DT_S
+                yaw += float(np.clip(4.0 * error, -turn, turn)) * CONTROL_DT_S
         poses.append((float(x), float(y), yaw))
     yield from _travel(body, np.array(poses), limits)
 
@@ -103,12 +106,12 @@ def _travel(body: Body, way: NDArray[np.float64], limits: NDArray[np.float64] = 
     start = body.posture.stance()
     way = np.concatenate([[(start.x, start.y, start.yaw_rad)], way])  # (T + 1, 3)
     bases, legs = body.base.walking_targets(way)
-    limits = np.maximum(limits, body.contacts.pushed() + 0.5 * _PUSHED)
+    limits, stops = np.maximum(limits, body.contacts.pushed() + 0.5 * _PUSHED), TwoTicks()
     for tick in range(1, len(way)):
         body.base.command(*map(float, bases[tick]))
-        body.base.command_legs(legs[tick])
+        body.base.place_legs(legs[tick])
         yield
-        if np.any(body.contacts.pushed() > limits):
+        if stops(bool(np.any(body.contacts.pushed() > limits))):
             yield from _retreat(body, way[: tick + 1], legs)
             walked = float(np.linalg.norm(body.posture.stance().position - start.position))
             raise SkillFailure(FailureCode.BLOCKED_PATH, {"travel_m": walked})
@@ -119,11 +122,11 @@ def _retreat(body: Body, way: NDArray[np.float64], legs: NDArray[np.float64]) ->
 
     def command(tick: int) -> None:
         body.base.command(*map(float, way[tick]))
-        body.base.command_legs(legs[tick])
+        body.base.place_legs(legs[tick])
 
     tick = yield from _go_back(body, len(way) - 1, command)
     for share in np.linspace(0.0, 1.0, round(0.3 / CONTROL_DT_S))[1:]:
-        body.base.command_legs((1.0 - share) * legs[tick] + share * legs[0])
+        body.base.place_legs((1.0 - share) * legs[tick] + share * legs[0])
         yield
 
 
@@ -199,7 +202,7 @@ def sweep(body: Body, arm: Arm, postures: NDArray[np.float64], stances: NDArray[
         if walking is not None:
             bases, legs = walking
             body.base.command(*map(float, bases[k]))
-            body.base.command_legs(legs[k])
+            body.base.place_legs(legs[k])
         yield
 
 
@@ -247,12 +250,12 @@ def change_height(body: Body, action: Action) -> Skill:
     low, high = body.spec.pelvis_height_range_m
     goal = float(np.clip(wanted, low, high))
     way = plan(np.array([[start], [goal]]), HEIGHT_SPEED_M_S, HEIGHT_ACCELERATION_M_S2)
-    limits = np.maximum(_PUSHED, body.contacts.pushed() + 0.5 * _PUSHED)
+    limits, stops = np.maximum(_PUSHED, body.contacts.pushed() + 0.5 * _PUSHED), TwoTicks()
     heights = [float(way.at(time_s)[0]) for time_s in _ticks(way.duration_s)]
     for tick, height_m in enumerate(heights):
         body.base.command_height(height_m)
         yield
-        if np.any(body.contacts.pushed() > limits):
+        if stops(bool(np.any(body.contacts.pushed() > limits))):
             yield from _go_back(body, tick, lambda earlier: body.base.command_height(heights[earlier]))
             goal = body.posture.pelvis_height_m
             break

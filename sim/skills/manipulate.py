@@ -28,7 +28,7 @@ from sim.skills.grasps import Grasp, grasp_candidates
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import Reach, diagnose, diagnosed, fulfils, plan_reach, route
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import CONTROL_DT_S, Skill, wait
+from sim.skills.runner import CONTROL_DT_S, Skill, TwoTicks, wait
 
 Array = NDArray[np.float64]
 
@@ -49,9 +49,15 @@ _MAX_PLANS: Final = 60
 _CARE: Final = 0.6
 #: A vessel with a liquid counts as upright below this tilt.
 _LEVEL_RAD: Final = float(np.radians(25.0))
+#: How deep what is carried may be in the robot's own body.
+OFF_BODY_M: Final = 0.003
 _UP: Final = np.array([0.0, 0.0, 1.0])
 #: An arm that is farther than this from where it was sent met something on the way.
 _STUCK_RAD: Final = 0.15
+#: How far an open hand draws back from what it has put down, how steeply, tried in turn, and how deep it may touch it then.
+_OFF_M: Final = 0.09
+_STEEP: Final = (0.0, 0.5, 1.5, 3.0)
+_GRAZE_M: Final = 0.0005
 #: Turns of what is put down about the vertical, rad, tried in turn.
 _TURNS: Final = (0.0, 0.35, -0.35, 0.75, -0.75, 1.2, -1.2)
 
@@ -148,10 +154,11 @@ def _carry(body: Body, arm: Arm, held: str) -> Array:
         pointing, closing = about @ pointing, about @ closing
     place_at = body.ik.hand_at(arm, usual)
     solved = body.ik.solve(arm, HandPose(place_at, pointing, closing), start=usual, roll_weight=0.2)
-    if body.obj(held).state.fillLitres > 0.0:
-        up = hand.T @ body.world.poses.pose(held)[:3, 2]
-        return _level(body, arm, up, place_at, pointing, closing, solved.q if solved.error_m < 0.05 else usual)
-    return solved.q if solved.error_m < 0.05 else usual
+    otherwise = solved.q if solved.error_m < 0.05 else usual
+    if body.obj(held).state.fillLitres <= 0.0 and body.probe.own_depth_m(body.obj(held), {arm: otherwise}) <= OFF_BODY_M:
+        return otherwise
+    up = hand.T @ body.world.poses.pose(held)[:3, 2]
+    return _level(body, arm, body.obj(held), up, HandPose(place_at, pointing, closing), otherwise)
 
 
 def _level_way(body: Body, arm: Arm, held: str, goal: Array) -> list[Array]:
@@ -182,19 +189,24 @@ def shift_hand(body: Body, arm: Arm, change: Array) -> Skill:
         yield from body.arms.move(arm, [goal.q], speed=0.6)
 
 
-def _level(body: Body, arm: Arm, up: Array, near: Array, pointing: Array, closing: Array, otherwise: Array) -> Array:
-    """(A,) posture around a point in which an object whose axis is `up` in the hand stands upright, or most nearly so."""
+def _level(body: Body, arm: Arm, obj: ObjectInstance, up: Array, near: HandPose, otherwise: Array) -> Array:
+    """(A,) posture near a hand pose in which an object whose axis is `up` in the hand stands upright, or most nearly so.
+
+    The object is off the robot's own body there.
+    """
     best: tuple[float, Array] | None = None
     ahead, left = body.posture.turn_to_world(np.array([1.0, 0.0, 0.0])), body.posture.turn_to_world(np.array([0.0, 1.0, 0.0]))
     outward = left if arm is Arm.LEFT else -left
     for forward in (0.0, 0.08, 0.16):
         for rise in (0.0, -0.1, 0.1, -0.2):
             for aside in (0.0, 0.08):
-                point = near + forward * ahead + aside * outward + rise * _UP
-                goal = body.ik.solve(arm, HandPose(point, pointing, closing), roll_weight=0.2)
+                point = near.position + forward * ahead + aside * outward + rise * _UP
+                goal = body.ik.solve(arm, HandPose(point, near.pointing, near.closing), roll_weight=0.2)
                 axes = np.stack([goal.pointing, goal.closing, np.cross(goal.pointing, goal.closing)], axis=1)
                 tilt = float(np.arccos(np.clip((axes @ up)[2], -1.0, 1.0)))
                 if goal.error_m > 0.05 or not body.probe.free(arm, [goal.q]):
+                    continue
+                if body.probe.own_depth_m(obj, {arm: goal.q}) > OFF_BODY_M:
                     continue
                 if best is None or tilt < best[0] - 0.02:
                     best = (tilt, goal.q)
@@ -206,11 +218,11 @@ def _level(body: Body, arm: Arm, up: Array, near: Array, pointing: Array, closin
 def _close(body: Body, arm: Arm, geoms: NDArray[np.int64]) -> Skill:
     """Closes the hand until both finger groups touch, or it is closed."""
     steps = 28
-    start = body.hands.opening(arm)
+    start, touch = body.hands.opening(arm), TwoTicks()
     for k in range(1, steps + 1):
         body.hands.command(arm, start * (1.0 - k / steps))
         yield
-        if k % 2 == 0 and max(body.probe.finger_gaps_m(arm, geoms)) <= 0.002:
+        if k % 2 == 0 and touch(max(body.probe.finger_gaps_m(arm, geoms)) <= 0.002):
             return
     yield from wait(0.1)
 
@@ -404,24 +416,42 @@ def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
             body.world.liquids.spill(obj)
         yield from stow(body, arm, name)
         raise SkillFailure(FailureCode.SPILLED if outcome == "spilled" else FailureCode.NOTHING_HAPPENED, contingency=outcome)
-    lowering = body.arms.move(arm, [reach.at], speed=0.6)
-    for _ in lowering:
+    rests = TwoTicks()
+    for _ in body.arms.move(arm, [reach.at], speed=0.6):
         yield
-        if body.contacts.rests(obj):
+        if rests(body.contacts.rests(obj)):
+            body.arms.hold([arm])
             break
     yield from wait(0.04)
     if outcome == "broken" and obj.type.has("breakable"):
         body.world.states.set_state(obj.object_id, "isBroken", True)
     body.world.grasps.detach(arm.value)
     yield from body.hands.move(arm, 1.0)
-    position, hand = body.arms.hand_pose(arm)
-    back = body.ik.solve(arm, HandPose(position + 0.09 * away, hand[:, 0], hand[:, 1]), start=body.arms.commanded(arm))
-    yield from body.arms.move(arm, [back.q if back.error_m < 0.03 else reach.before])
+    yield from body.arms.move(arm, [_off(body, arm, away, reach)])
     yield from stow(body, arm)
     if outcome == "broken":
         yield from at_rest(body, obj)
         raise SkillFailure(FailureCode.BROKE, contingency=outcome)
     yield from set_down(body, obj, receptacle)
+
+
+def _off(body: Body, arm: Arm, away: Array, reach: Reach) -> Array:
+    """(A,) posture of the open hand off what it has put down: straight back, or steeper where its fingers would drag on it."""
+    start = body.arms.commanded(arm)
+    position, hand = body.arms.hand_pose(arm)
+    best: tuple[float, Array] | None = None
+    for steep in _STEEP:
+        way = _OFF_M * (away + steep * _UP) / float(np.linalg.norm(away + steep * _UP))
+        goal = body.ik.solve(arm, HandPose(position + way, hand[:, 0], hand[:, 1]), start=start)
+        if goal.error_m > 0.03:
+            continue
+        postures = start + np.linspace(0.0, 1.0, 6)[1:, None] * (goal.q - start)
+        depth = float(body.probe.depths_m(arm, postures, opening=1.0).max())
+        if best is None or depth < best[0] - _GRAZE_M:
+            best = (depth, goal.q)
+        if depth <= _GRAZE_M:
+            break
+    return reach.before if best is None else best[1]
 
 
 #: Speed of what is at rest, for how long it has to keep to it, and how long that is waited for.

@@ -28,6 +28,18 @@ CONTROL_DT_S: Final = 0.02
 _MAX_TICKS: Final = int(120.0 / CONTROL_DT_S)
 
 
+class TwoTicks:
+    """A condition that counts when it holds twice running: a contact that flickers in the last bits decides nothing."""
+
+    def __init__(self) -> None:
+        self._before = False
+
+    def __call__(self, now: bool) -> bool:
+        """Whether it holds now and held when it was last asked."""
+        both, self._before = now and self._before, now
+        return both
+
+
 def run_skills(skills: Sequence[tuple[Action, Skill]], advance: Callable[[], None]) -> tuple[ActionOutcome, ...]:
     """Advances all skills together until each has ended.
 

@@ -30,7 +30,7 @@ from sim.skills.manipulate import OutcomeDraw, set_down, upright
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import diagnose
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import Skill, wait
+from sim.skills.runner import Skill, TwoTicks, wait
 from sim.skills.two_arm import BOTH_TOLERANCE_M, against_sag, hands_m, way_round
 
 Array = NDArray[np.float64]
@@ -246,9 +246,11 @@ def place_both(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     if outcome != "success":
         yield from body.arms.move_both([*first, hold], speed=0.6)
         raise SkillFailure(FailureCode.NOTHING_HAPPENED, contingency=outcome)
+    rests = TwoTicks()
     for _ in body.arms.move_both([placement.at], speed=0.4):
         yield
-        if body.contacts.rests(obj):
+        if rests(body.contacts.rests(obj)):
+            body.arms.hold(Arm)
             break
     yield from wait(0.1)
     for arm in Arm:

@@ -23,11 +23,11 @@ from sim.skills.body.body import Body
 from sim.skills.body.ik import BothGoal
 from sim.skills.failures import SkillFailure, require
 from sim.skills.grasps import solid_box
-from sim.skills.manipulate import GRASP_GAP_M, OutcomeDraw
+from sim.skills.manipulate import GRASP_GAP_M, OFF_BODY_M, OutcomeDraw
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import diagnose, route
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import CONTROL_DT_S, Skill, wait
+from sim.skills.runner import CONTROL_DT_S, Skill, TwoTicks, wait
 
 Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
@@ -169,6 +169,8 @@ def lift(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     options = [(up, goal) for up, goal in options if goal.error_m <= BOTH_TOLERANCE_M]
     if options:
         before_m = hands_m(body)
+        clear = [(up, goal) for up, goal in options if body.probe.own_depth_m(obj, goal.arms, goal.waist) <= OFF_BODY_M]
+        options = clear or options
         up, hold = min(options, key=lambda option: option[1].tilt_rad - _HEIGHT_WEIGHT * option[0])
         yield from body.arms.move_both([hold], speed=0.5)
         yield from wait(0.1)
@@ -203,10 +205,10 @@ def _press(body: Body, reach: BothReach, obj: ObjectInstance) -> Skill:
     geoms = body.objects.solid_geoms(obj)
     start = body.arms.commanded_both()
     steps = round(0.5 / CONTROL_DT_S)
-    share = dict.fromkeys(Arm, 0.0)
+    share, touches = dict.fromkeys(Arm, 0.0), {arm: TwoTicks() for arm in Arm}
     for k in range(1, round(1.3 * steps) + 1):
         for arm in Arm:
-            if k % 2 == 0 and body.probe.hand_gap_m(arm, geoms) < 0.001:
+            if k % 2 == 0 and touches[arm](body.probe.hand_gap_m(arm, geoms) < 0.001):
                 continue
             share[arm] = min(k / steps, 1.3)
             body.arms.command(arm, start[arm] + share[arm] * (reach.at.arms[arm] - start[arm]))

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.scene.compiler import ARM_BITS, HELD_BITS, HELD_DOOR_BITS, LIMB_BIT, MOVABLE_BITS, STATIC_BITS
+from sim.scene.compiler import ARM_BITS, HELD_BITS, HELD_DOOR_BITS, LIMB_BIT, MOVABLE_BITS, OWN_BIT, STATIC_BITS
 
 _SEPARATION_M = 0.001
 #: Of a tree that has just moved.
@@ -59,6 +59,20 @@ class GraspConstraints:
             chain = [body for body in range(model.nbody) if self._below(hand, body)]
             limb = inside | (np.isin(model.geom_bodyid, chain) & (model.geom_contype == LIMB_BIT))
             model.geom_contype[limb] |= ARM_BITS[arm]
+        self._meet_the_body()
+
+    def _meet_the_body(self) -> None:
+        """Lets what is held meet the robot's trunk, head, upper arms and legs."""
+        model = self.model
+        fore = [body for body in range(model.nbody) if np.any(model.geom_contype[model.geom_bodyid == body] & LIMB_BIT)]
+        roots = {int(model.body_rootid[hand]) for hand in self.hand_bodies.values()}
+        for body in range(model.nbody):
+            if int(model.body_rootid[body]) in roots and not any(self._below(body, limb) for limb in fore):
+                own = (model.geom_bodyid == body) & (model.geom_type != int(mujoco.mjtGeom.mjGEOM_MESH))
+                model.geom_contype[own] = OWN_BIT
+                model.body_contype[body] |= OWN_BIT
+            elif model.body_contype[body] & MOVABLE_BITS[0]:
+                model.body_conaffinity[body] |= OWN_BIT
 
     def _below(self, body: int, ancestor: int) -> bool:
         while body > 0:

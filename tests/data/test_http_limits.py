@@ -97,8 +97,8 @@ def test_an_interrupt_while_a_connection_is_handed_over_ends_the_server(monkeypa
         server.timeout = 20.0
         with connect(server) as client:
             client.sendall(b"GET / HTTP/1.1\r\nConnection: close\r\n\r\n")
-            with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-                patch.setattr(threading, "Thread", Interrupted)
+            monkeypatch.setattr(threading, "Thread", Interrupted)
+            with pytest.raises(KeyboardInterrupt):
                 server.handle_request()
         assert not server._served
 

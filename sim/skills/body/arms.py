@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Final
 
 import mujoco
@@ -62,6 +62,11 @@ class Arms:
         """Sets the arm joints' targets."""
         self._data.ctrl[self._joints.arms[arm]] = q
 
+    def hold(self, arms: Iterable[Arm]) -> None:
+        """Commands the joints of arms to where they are."""
+        for arm in arms:
+            self.command(arm, self._data.qpos[self._joints.arm_positions[arm]])
+
     def hand_pose(self, arm: Arm) -> tuple[Array, Array]:
         """Measured world position (3,) and rotation (3, 3) of the grasp site."""
         site = self._joints.grasp_sites[arm]
@@ -74,7 +79,8 @@ class Arms:
             ends = np.stack([self._data.ctrl[ids].copy(), goal])
             least_s = self._least_s(arm, ends, speed)
             way = plan(ends, ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed * speed, least_s)
-            yield from self._follow(way, ids, arms=(arm,))
+            if (yield from self._follow(way, ids, arms=(arm,))):
+                return
 
     def _least_s(self, arm: Arm, ends: Array, speed: float) -> float:
         """Duration below which what the hand carries would be too fast between two postures (2, A)."""
@@ -101,8 +107,10 @@ class Arms:
         lead: bool = True,
         stop: Callable[[], bool] = lambda: False,
         arms: Sequence[Arm] = (),
-    ) -> Skill:
-        """Tracks a trajectory with the servos.
+    ) -> Generator[None, None, bool]:
+        """Tracks a trajectory with the servos; returns whether something holds up what the arms carry.
+
+        They then rest where they are: bent against their servos, they would fling it when they come free.
 
         Args:
             way: of the joints.
@@ -124,7 +132,8 @@ class Arms:
             if waited < _PATIENCE and off_rad(time_s) > sag_rad + _BEHIND_RAD.get(len(arms), np.inf):
                 waited += 1
                 if waited == _PATIENCE and loaded:
-                    return
+                    self.hold(arms)
+                    return True
                 self._data.ctrl[ids] = way.at(time_s)
                 yield
                 continue
@@ -135,6 +144,7 @@ class Arms:
                 target = target + self._joints.lag_s[ids] * rate
             self._data.ctrl[ids] = target
             yield
+        return False
 
     def move_both(self, goals: Sequence[BothGoal], speed: float = 1.0) -> Skill:
         """Moves both arms and the waist together in joint space through a sequence of goals."""
@@ -143,7 +153,8 @@ class Arms:
             row = np.concatenate([goal.arms[Arm.LEFT], goal.arms[Arm.RIGHT], goal.waist])
             ends = np.stack([self._data.ctrl[ids].copy(), row])
             way = plan(ends, ARM_SPEED_RAD_S * speed, ARM_ACCELERATION_RAD_S2 * speed**2)
-            yield from self._follow(way, ids, arms=(Arm.LEFT, Arm.RIGHT))
+            if (yield from self._follow(way, ids, arms=(Arm.LEFT, Arm.RIGHT))):
+                return
 
     def ready_both(self) -> BothGoal:
         """Both arms in their ready postures, waist straight."""

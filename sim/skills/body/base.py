@@ -42,28 +42,31 @@ class Base:
         """Sets the pelvis height and the legs that go with it."""
         self._servos.command_height(pelvis_height_m)
 
-    def command_legs(self, joints: Array) -> None:
-        """Sets the leg joints' targets (L,)."""
-        self._data.ctrl[self._joints.legs] = joints
+    def place_legs(self, joints: Array) -> None:
+        """Brings the leg joints to (L,) within one control tick, without the lag of their servos: they touch nothing."""
+        data, at = self._data, self._joints.leg_positions
+        rates = (joints - data.qpos[at]) / CONTROL_DT_S
+        data.qvel[self._joints.leg_speeds] = rates
+        data.ctrl[self._joints.legs] = joints + self._joints.lag_s[self._joints.legs] * rates
 
     def walking_targets(self, way: Array) -> tuple[Array, Array]:
-        """Servo targets for base and legs along a path (T, 3) of x, y and yaw, with compensation of the servo lag.
+        """Targets for base and legs along a path (T, 3) of x, y and yaw.
 
         Returns:
-            (T, 3) base targets and (T, L) leg joints; the last ones are at rest.
+            (T, 3) commands of the base, ahead of its servos' lag, and (T, L) leg joints; the last ones are at rest.
         """
         height = self._posture.pelvis_height_m
         crouch = self._kit.crouches.posture(height)
         soles = self._kit.model.frames(self._posture.root(height), crouch, ("left_sole", "right_sole"))
         legs = leg_motion(footsteps(self._kit), height, soles[:, :2, 3], way)
         base_ids = np.array([self._joints.base[0], self._joints.base[1], self._joints.base[3]])
-        return _ahead(way, self._joints.lag_s[base_ids]), _ahead(legs, self._joints.lag_s[self._joints.legs])
+        return _ahead(way, self._joints.lag_s[base_ids]), legs
 
 
 def _ahead(targets: Array, lag_s: Array) -> Array:
-    """Targets (T, N) of a motion that ends at rest, advanced by the servo lags (N,)."""
+    """Targets (T, N) of a motion that ends at rest, advanced by the servo lags (N,) less what holding each for a tick gains."""
     if len(targets) < 2:
         return targets
     rates = np.gradient(targets, CONTROL_DT_S, axis=0)
     rates[-1] = 0.0
-    return targets + lag_s * rates
+    return targets + (lag_s - 0.5 * CONTROL_DT_S) * rates

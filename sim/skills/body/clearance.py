@@ -6,7 +6,7 @@ The hand's distance to an object is measured in the world itself, because the gr
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from interface.bodies import Arm
 from robots.build_solver import RobotKit
+from sim.scene.compiler import LIMB_BIT, OWN_BIT
 from sim.scene.objects import MovingPart, ObjectInstance
 from sim.skills.body.joints import JointMap
 from sim.skills.body.posture import Posture
@@ -245,6 +246,35 @@ class ClearanceProbe:
             depths.append(max(0.0, float(-np.min(scratch.contact.dist[: scratch.ncon][counts], initial=0.0))))
         return np.array(depths)
 
+    def own_depth_m(self, obj: ObjectInstance, arms: Mapping[Arm, Array], waist: Array | None = None) -> float:
+        """Penetration of a held object into the robot's trunk, head, legs and upper arms.
+
+        Args:
+            obj: moves with the hand that holds it; what both hold moves as the middle between them does, and does not turn.
+            arms: arm joints (A,) of the arms that hold it.
+            waist: waist joints; as they are when None.
+        """
+        world, scratch, model = self._world, self._scratch, self._world.model
+        self._copy_state()
+        for arm, posture in arms.items():
+            scratch.qpos[self._joints.arm_positions[arm]] = posture
+        if waist is not None:
+            scratch.qpos[self._waist_adr] = waist
+        mujoco.mj_kinematics(model, scratch)
+        cargo = self._cargo(next(iter(arms)))
+        if cargo is None:
+            sites = [self._joints.grasp_sites[arm] for arm in arms]
+            way = (scratch.site_xpos[sites] - world.data.site_xpos[sites]).mean(axis=0)
+            scratch.qpos[obj.qpos_adr : obj.qpos_adr + 3] += way
+            mujoco.mj_kinematics(model, scratch)
+        else:
+            cargo.follow(model, scratch)
+        mujoco.mj_collision(model, scratch)
+        load, own = np.isin(np.arange(model.ngeom), obj.geom_ids), model.geom_contype == OWN_BIT
+        a, b = scratch.contact.geom[: scratch.ncon].T
+        counts = (load[a] & own[b]) | (load[b] & own[a])
+        return max(0.0, float(-np.min(scratch.contact.dist[: scratch.ncon][counts], initial=0.0)))
+
     def finger_gaps_m(self, arm: Arm, geoms: NDArray[np.int64]) -> tuple[float, float]:
         """Distance of each of the two opposing finger groups to some geoms, in the world as it is, negative inside."""
         gaps = []
@@ -283,9 +313,7 @@ def _limb_geoms(model: mujoco.MjModel, joint: str) -> frozenset[int]:
     for index in range(top + 1, model.nbody):
         if int(model.body_parentid[index]) in below:
             below.add(index)
-    geoms = np.flatnonzero(
-        np.isin(model.geom_bodyid, sorted(below)) & ((model.geom_contype > 0) | (model.geom_conaffinity > 0))
-    )
+    geoms = np.flatnonzero(np.isin(model.geom_bodyid, sorted(below)) & ((model.geom_contype & LIMB_BIT) > 0))
     return frozenset(int(index) for index in geoms)
 
 

@@ -28,6 +28,7 @@ class JointMap:
         arms, hands: actuators per arm.
         arm_positions: (A,) addresses in `qpos` per arm.
         legs, waist: actuators.
+        leg_positions, leg_speeds: (L,) addresses in `qpos` and `qvel`.
         grasp_sites: site per arm.
         lag_s: (nu,) how far each servo is behind a steadily moving target: its damping over its stiffness.
     """
@@ -40,6 +41,8 @@ class JointMap:
         self.hands = {arm: self._ids(spec.arms[arm.value].hand_joints) for arm in Arm}
         self.arm_positions = {arm: _addresses(model, spec.arms[arm.value].joints) for arm in Arm}
         self.legs, self.waist = self._ids(spec.leg_joints), self._ids(spec.waist_joints)
+        self.leg_positions = _addresses(model, spec.leg_joints)
+        self.leg_speeds = np.array([int(model.joint(name).dofadr[0]) for name in spec.leg_joints])
         self.grasp_sites = {arm: int(model.site(spec.arms[arm.value].grasp_site).id) for arm in Arm}
         self.lag_s = _lags(model)
 

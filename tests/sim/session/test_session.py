@@ -57,6 +57,16 @@ def test_success_takes_every_goal(session):
         assert session.succeeded == session.finished == (bool(status) and all(status))
 
 
+def test_goals_are_read_when_things_have_come_to_rest(session):
+    session.reset(replace(TASK, goals=(Predicate("on", "Mug_1", "CounterTop_1"),)), 0)
+    mug, data = session.world.objects["Mug_1"], session.world.data
+    data.qpos[mug.qpos_adr + 2] += 0.02
+    data.qvel[mug.dof_adr + 1] = -3.0  # off over the front edge
+    assert session.succeeded
+    feedback = session.act(PlanStep.parse("Done()"))
+    assert feedback.duration_s == 0.0 and not session.succeeded
+
+
 def test_observation_holds_what_a_planner_may_see(session):
     seen = session.reset(TASK, 0)
     assert seen.image.shape == (56, 56, 3) and seen.robot == "h1" and seen.instruction == "Bring the mug."

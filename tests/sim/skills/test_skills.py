@@ -16,7 +16,7 @@ from sim.skills.failures import SkillFailure
 from sim.skills.navigation import Stance
 from sim.skills.plan_cache import cached_plan
 from sim.skills.push_door import Push
-from sim.skills.runner import refuse, run_skills
+from sim.skills.runner import TwoTicks, refuse, run_skills
 from sim.skills.set_down import assess_place_both
 from sim.world.world import World
 
@@ -318,6 +318,11 @@ def test_refuse_and_runaway_skills():
     with pytest.raises(RuntimeError, match=r"skills did not end within 120 s: \['ResetArm\(left\)'\]"):
         run_skills([(action, endless())], lambda: None)
     assert isinstance(SkillFailure(FailureCode.DROPPED), Exception)
+
+
+def test_a_contact_counts_when_it_holds_twice_running() -> None:
+    touches = TwoTicks()
+    assert [touches(now) for now in (True, False, True, True, False)] == [False, False, False, True, False]
 
 
 def test_a_world_without_robot_is_refused():

@@ -39,6 +39,27 @@ def soles_on(robot: str, height_m: float, way: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_soles_are_where_the_gait_puts_them(robot: str) -> None:
+    kit = robot_kit(robot)
+    low, high = kit.spec.pelvis_height_range_m
+    height_m = 0.4 * low + 0.6 * high
+    steps, rng = footsteps(kit), np.random.default_rng(0)
+    ahead_m, aside_m = steps.reach_m(height_m)
+    feet = np.cumsum(rng.normal(0.0, 1.0, (60, 2, 4)), axis=0)
+    feet = np.sin(0.3 * feet) * (ahead_m, 0.5 * aside_m, 0.0, 0.1)
+    legs, base = steps.joints(height_m, feet), kit.crouches.posture(height_m)
+    index, names = kit.model.indices(kit.spec.leg_joints), ("left_sole", "right_sole")
+    root = np.array([0.0, 0.0, height_m, *root_quaternion(0.0, kit.crouches.pitch(height_m))])
+    neutral = kit.model.frames(root, base, names)[:, :3, 3]
+    for wanted, joints in zip(feet, legs, strict=True):
+        q = base.copy()
+        q[index] = joints
+        assert np.all((joints >= kit.model.lower[index]) & (joints <= kit.model.upper[index]))
+        missed = kit.model.frames(root, q, names)[:, :3, 3] - neutral - wanted[:, :3]
+        assert np.linalg.norm(missed, axis=1).max() < 0.012
+
+
 def ways() -> dict[str, np.ndarray]:
     steps = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 120))
     zero = np.zeros(120)
@@ -87,6 +108,36 @@ def test_walking_moves_the_legs_and_leaves_them_as_they_were(robot: str) -> None
     assert np.array(heights).min() > -0.02 and np.array(heights).min(axis=1).max() < 0.05
     after = np.array([world.servos.joint_targets()[name] for name in names])
     np.testing.assert_allclose(after, before, atol=1e-3)
+
+
+@pytest.mark.parametrize(("robot", "down_m"), [("h1", 0.1), ("x1", 0.05)])
+def test_the_standing_foot_stays_where_it_is(robot: str, down_m: float) -> None:
+    session = Session(robot, image_size=0, all_known=True)
+    session.reset(FreePlay("living_room_1", placements=()), 0)
+    world, foot = session.world, session.robot.foot
+    sites = [int(world.model.site(f"{side}_sole").id) for side in ("left", "right")]
+    corners = np.array([(a * foot.half_length_m, b * foot.half_width_m, 0.0) for a in (-1, 1) for b in (-1, 1)])
+    seen: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def watch(*_: object) -> None:
+        turns = world.data.site_xmat[sites].reshape(2, 3, 3)
+        soles = world.data.site_xpos[sites][:, None] + corners @ turns.transpose(0, 2, 1)  # (2, 4, 3)
+        seen.append((soles, world.servos.base_pose[:2].copy()))
+
+    assert session.step(PlanStep.parse(f"MoveDown({down_m})"))[1].success
+    session.watchers.append(watch)
+    for text in ("MoveAhead(0.5)", "MoveBack(0.5)", "MoveLeft(0.4)", "MoveRight(0.4)"):
+        seen.clear()
+        assert session.step(PlanStep.parse(text))[1].success
+        slip, way = 0.0, 0.0
+        for (before, start), (after, end) in zip(seen, seen[1:], strict=False):
+            lower = int(np.argmin(after[:, :, 2].min(axis=1)))
+            slip += float(np.linalg.norm((after[lower] - before[lower]).mean(axis=0)[:2]))
+            way += float(np.linalg.norm(end - start))
+        assert way > 0.35
+        assert slip < 0.1 * way, text
+        assert min(float(soles[:, :, 2].min()) for soles, _ in seen) > -0.01, text
+    session.close()
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

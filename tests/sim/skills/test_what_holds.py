@@ -11,6 +11,7 @@ import pytest
 from interface.steps import PlanStep
 from sim.scene.objects import ObjectPlacement
 from sim.session.session import FreePlay, Session
+from sim.skills.manipulate import OFF_BODY_M
 from sim.skills.runner import CONTROL_DT_S
 from sim.world.world import World
 
@@ -85,6 +86,26 @@ def test_fingers_rest_on_what_they_hold(carrying: Session) -> None:
     servos, spec = carrying.world.servos, carrying.world.scene.the_robot().arms["right"]
     told, measured = servos.joint_targets(), servos.joint_positions()
     assert max(abs(told[name] - measured[name]) for name in spec.hand_joints) < 0.02
+
+
+def test_what_is_held_meets_the_body_of_the_robot(carrying: Session) -> None:
+    world, item = carrying.world, carrying.world.objects["Mug_1"]
+    model, data = world.model, world.data
+    arm = next(one for one, name in carrying.body.hands.held.items() if name is not None)
+    assert carrying.body.probe.own_depth_m(item, {arm: carrying.body.arms.commanded(arm)}) <= OFF_BODY_M
+    shoulder = carrying.body.posture.shoulder(arm)
+    home = data.qpos[item.qpos_adr : item.qpos_adr + 3].copy()
+
+    def meets() -> bool:
+        mujoco.mj_forward(model, data)
+        pairs = model.geom_bodyid[data.contact.geom[: data.ncon]]
+        return any(item.body_id in pair and set(map(int, pair)) & world.scene.robot_bodies for pair in pairs)
+
+    assert not meets()
+    data.qpos[item.qpos_adr : item.qpos_adr + 3] = shoulder
+    assert meets()
+    data.qpos[item.qpos_adr : item.qpos_adr + 3] = home
+    assert not meets()
 
 
 @pytest.mark.parametrize(("turn", "tilt_deg"), [((1, 0, 0), 0.0), ((1, 0, 0), 30.0), ((0, 1, 0), 88.0), ((1, 0, 0), 90.0)])
