@@ -218,11 +218,11 @@ def _level(body: Body, arm: Arm, obj: ObjectInstance, up: Array, near: HandPose,
 def _close(body: Body, arm: Arm, geoms: NDArray[np.int64]) -> Skill:
     """Closes the hand until both finger groups touch, or it is closed."""
     steps = 28
-    start, touch = body.hands.opening(arm), TwoTicks()
+    start = body.hands.opening(arm)
     for k in range(1, steps + 1):
         body.hands.command(arm, start * (1.0 - k / steps))
         yield
-        if k % 2 == 0 and touch(max(body.probe.finger_gaps_m(arm, geoms)) <= 0.002):
+        if k % 2 == 0 and max(body.probe.finger_gaps_m(arm, geoms)) <= 0.002:
             return
     yield from wait(0.1)
 

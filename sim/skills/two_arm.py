@@ -27,7 +27,7 @@ from sim.skills.manipulate import GRASP_GAP_M, OFF_BODY_M, OutcomeDraw
 from sim.skills.plan_cache import cached_plan
 from sim.skills.reach import diagnose, route
 from sim.skills.reach_map import HandPose
-from sim.skills.runner import CONTROL_DT_S, Skill, TwoTicks, wait
+from sim.skills.runner import CONTROL_DT_S, Skill, wait
 
 Array = NDArray[np.float64]
 _UP: Final = np.array([0.0, 0.0, 1.0])
@@ -205,10 +205,10 @@ def _press(body: Body, reach: BothReach, obj: ObjectInstance) -> Skill:
     geoms = body.objects.solid_geoms(obj)
     start = body.arms.commanded_both()
     steps = round(0.5 / CONTROL_DT_S)
-    share, touches = dict.fromkeys(Arm, 0.0), {arm: TwoTicks() for arm in Arm}
+    share = dict.fromkeys(Arm, 0.0)
     for k in range(1, round(1.3 * steps) + 1):
         for arm in Arm:
-            if k % 2 == 0 and touches[arm](body.probe.hand_gap_m(arm, geoms) < 0.001):
+            if k % 2 == 0 and body.probe.hand_gap_m(arm, geoms) < 0.001:
                 continue
             share[arm] = min(k / steps, 1.3)
             body.arms.command(arm, start[arm] + share[arm] * (reach.at.arms[arm] - start[arm]))

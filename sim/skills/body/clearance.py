@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 #: Penetration that still counts as touching only.
 TOUCH_M: Final = 0.009
+#: How much deeper than anything else what is held may be in the robot's own body on the way: the arm yields so far.
+_YIELDS_M: Final = 0.02
 #: Distance beyond which finger gaps are not measured.
 _FAR_M: Final = 0.2
 
@@ -161,7 +163,8 @@ class ClearanceProbe:
             a, b = scratch.contact.geom[: scratch.ncon].T
             other = np.where(touching[a], b, a)
             counts = (touching[a] != touching[b]) & barred[other]
-            depths.append(max(0.0, float(-np.min(scratch.contact.dist[: scratch.ncon][counts], initial=0.0))))
+            depth_m = -scratch.contact.dist[: scratch.ncon] - _YIELDS_M * (model.geom_contype[other] == OWN_BIT)
+            depths.append(float(np.max(depth_m[counts], initial=0.0)))
             if depths[-1] - (0.0 if relief is None else depths[0] * relief[len(depths) - 1]) > limit_m:
                 break
         return np.array(depths)
