@@ -2,7 +2,7 @@
 
     python benchmarks/planner_machinery.py [--tasks 20] [--robot h1] [--mistakes 0.15] [--memory outputs/memory] [--out FILE.md]
 
-The same tasks, luck and script (`benchmarks/imperfect_expert.py`) for every planner, in one run:
+The same tasks, contingencies and script (`benchmarks/imperfect_expert.py`) for every planner, in one run:
 
 * reflection: success at difficulty medium, where half of the skills fail by chance, with reflection and without;
 * mistakes: success at easy when the script slips (wrong arm, wrong height, too far, malformed) in a share of its steps;

@@ -1,4 +1,4 @@
-"""Frozen configuration of evaluation: which planner, on which robot, tasks and luck, and which table to assemble."""
+"""Frozen configuration of evaluation: which planner, on which robot, tasks and contingencies, and which table to assemble."""
 
 from __future__ import annotations
 
@@ -137,14 +137,14 @@ class EvalConfig(Execution):
         difficulty: success of low-level skills: easy 100 %, medium 50 %, hard 20 %, natural as the rules say.
         contingencies: outcome distributions, a name of `configs/contingency` or of one's own assets.
         category: tasks of one category, or all.
-        trials: episodes per task; the luck and the random streams differ between trials.
+        trials: episodes per task; the contingencies and the random streams differ between trials.
         steps: charged steps of an episode, 50 in the paper; `task` ends it at the task's time limit.
         stuck: an episode ends when its last so many steps are only one or two different ones, each with the same outcome, view
             and place every time; 0 lets it run on.
         start: `fixed` starts where the task says, `turned` there with a heading drawn per trial, `random` anywhere free in the
             room with heading and pelvis height drawn per trial.
         split: tasks whose `split` this is, or all.
-        seed: of the luck, hashed with task, robot and trial.
+        seed: of the contingencies, hashed with task, robot and trial.
         tasks: `benchmark`, or the path of a JSON-lines file of tasks.
         limit: only the first so many tasks of each category.
         feedback: `codes` tells planners why an action failed, `bit` only that it did.

@@ -284,7 +284,7 @@ class _Repetition:
         self._marks: deque[tuple[object, tuple[float, ...]]] = deque(maxlen=max(steps, 1))
 
     def seen(self, session: RunnableSession, observation: Observation, item: HistoryItem, met: Sequence[bool]) -> None:
-        """Takes a step that no bad luck struck."""
+        """Takes a step that no contingency struck."""
         if self._steps:
             x, y, yaw, height = session.stance()
             place = (x, y, math.cos(yaw), math.sin(yaw), height)

@@ -1,6 +1,7 @@
 """Seeds of an episode: hashed from (task, robot, trial) and the run's seed, never from a clock or a process id.
 
-The planner is not part of the hash: every planner meets the same luck in the same trial, so planners are compared in pairs.
+The planner is not part of the hash: every planner meets the same contingencies in the same trial, so planners are compared in
+pairs.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Reports on what exists: `python -m proprio_mllm report` lists them.
 
-`compare` sets two planners side by side on the same body, tasks and luck, `gap` one planner on two bodies, `write` writes a
-run's `summary.json` and tables again, for example after the run at `difficulty=easy` that its regret needs.
+`compare` sets two planners side by side on the same body, tasks and contingencies, `gap` one planner on two bodies, `write`
+writes a run's `summary.json` and tables again, for example after the run at `difficulty=easy` that its regret needs.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Two runs side by side: on the same tasks and luck, or one planner on two bodies.
+"""Two runs side by side: on the same tasks and contingencies, or one planner on two bodies.
 
 A pair is an episode (task, trial) that both runs have scored. Values of a task's trials are averaged, tasks are the sample:
 the difference is the mean over tasks, its interval a cluster bootstrap over tasks, and the p-value an exact sign test over the
 tasks on which the two differ, which with one trial and success is McNemar's exact test. Runs that did not meet the same tasks
-and luck are refused. Two bodies do not share their luck, since the robot is part of an episode's seed: there tasks are paired,
-draws are not.
+and contingencies are refused. Two bodies do not share their contingencies, since the robot is part of an episode's seed: there
+tasks are paired, draws are not.
 
 Paper: gives no paired comparison.
 """
@@ -39,7 +39,7 @@ class RunComparison:
     """A comparison of two runs.
 
     Attributes:
-        kind: `planners` (same body, tasks and luck) or `bodies`.
+        kind: `planners` (same body, tasks and contingencies) or `bodies`.
         names: label, robot and folder of the two.
         rows: by category and `all`, then by figure: `success`, `in_time`, `goal_conditions`, `steps`, and `steps_both_solved`,
             which is left out where no episode was solved by both.
@@ -184,7 +184,7 @@ def comparison_table(result: RunComparison) -> Table:
         f"lost, {labels[0]} succeeds less often: {', '.join(success.below) or 'none'}.",
     ]
     if result.kind == "bodies":
-        notes.append("Two bodies: tasks are paired, the luck of their trials is not.")
+        notes.append("Two bodies: tasks are paired, the contingencies of their trials are not.")
     if result.left_out:
         notes.append(f"{result.left_out} planned episodes are not scored in both runs and left out.")
     return Table(f"{labels[0]} against {labels[1]}", columns, tuple(body), tuple(notes))

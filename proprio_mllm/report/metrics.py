@@ -1,4 +1,4 @@
-"""Figures of episodes beyond success: path-length weighting, steps against the expert's, recovery from bad luck, regret.
+"""Figures of episodes beyond success: path-length weighting, steps against the expert's, recovery from contingencies, regret.
 
 With S the success of an episode (0 or 1), l the length of the base's path in the certificate and p the episode's own:
 
@@ -9,7 +9,7 @@ With S the success of an episode (0 or 1), l the length of the base's path in th
 * recovery: an event is an action whose draw of the contingency was not success. It is recovered when its episode succeeds, and
   made good when the same verb on the same object succeeds later in the episode, with either arm (the rule of `attribution`).
 * regret: success of the same planner in the same episodes at `easy` minus success here; and mean own steps minus the expert's
-  over episodes that both solved at this difficulty with this luck.
+  over episodes that both solved at this difficulty with these contingencies.
 
 * first tries: the first time in an episode that a verb is tried at a target with an arm, or with both, and not refused by what
   the hands and the target are. It is in reach unless its code is `TooFar` (wrong by stance), `BodyTooHigh` or `BodyTooLow` (by

@@ -1,8 +1,8 @@
-"""Acts episodes out again from their ledger line, with their own luck and no planner: for pictures, films and training data.
+"""Acts episodes out again from their ledger line, with the same contingencies and no planner: for pictures, films and data.
 
-The ledger holds the plan and the feedback of every step, and a scene and its luck follow from the episode's key, so the same
-steps give the same world. A step whose codes are not the ledger's is told apart (`Moment.differs`): the simulator has changed
-since. An episode whose task is not in its file any more, or is another one under the same id, is refused.
+The ledger holds the plan and the feedback of every step, and a scene and its contingencies follow from the episode's key, so
+the same steps give the same world. A step whose codes are not the ledger's is told apart (`Moment.differs`): the simulator has
+changed since. An episode whose task is not in its file any more, or is another one under the same id, is refused.
 """
 
 from __future__ import annotations

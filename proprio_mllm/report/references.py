@@ -1,4 +1,4 @@
-"""What an episode is measured against: the expert's certificate, the same planner at `easy`, the expert with this luck.
+"""What an episode is measured against: its certificate, the same planner at `easy`, the expert with the same contingencies.
 
 A certificate (`sim/tasks/certificates.jsonl`) is the expert's plan for a task's own start and the robot as shipped. It stands
 for an episode only when the run had this task with this content, `start=fixed` and no robot description of the user's own.
@@ -68,7 +68,7 @@ def _same_episodes(run: Run, other: Run) -> dict[Episode, EpisodeRecord]:
 
 
 def _beside(run: Run, **wanted: object) -> dict[Episode, EpisodeRecord]:
-    """Episodes of runs beside a run with these settings and its robot, start, seed and luck; the newest stand.
+    """Episodes of runs beside a run with these settings and its robot, start, seed and contingencies; the newest stand.
 
     A neighbour that cannot be read is passed by with a warning: it must not cost a finished run its report.
     """

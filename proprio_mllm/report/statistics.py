@@ -2,7 +2,7 @@
 
 Trials of one task are correlated: in the paper's tables almost every rate is a multiple of one task, so the effective sample
 size is the number of tasks. Where all trials of each task agree (always so with one trial), the interval is Wilson's over
-tasks; otherwise a cluster bootstrap draws whole tasks. Planners are compared in pairs on the same tasks and luck.
+tasks; otherwise a cluster bootstrap draws whole tasks. Planners are compared in pairs on the same tasks and contingencies.
 
 Paper: prints no intervals.
 """

@@ -122,7 +122,7 @@ class Run:
         """One row per category that was planned, and one for all.
 
         Args:
-            references: what path lengths, steps and luck are measured against; nothing by default.
+            references: what path lengths, steps and contingencies are measured against; nothing by default.
         """
         planned = {category for _, category, _, _ in self.metadata["planned"]}
         known = [category for category in CATEGORIES if category in planned]

@@ -1,7 +1,7 @@
 """One episode as a strip of pictures: `python -m proprio_mllm report strip RUN TASK [trial=0] [out=FILE.png]`.
 
-The episode is acted out again from its trace, with its own luck, so no planner is needed; a step whose result differs from the
-ledger's is marked. Columns are plan steps: the head view, a view from its side, the plan text and the failure codes.
+The episode is acted out again from its trace, with its own contingencies, so no planner is needed; a step whose result differs
+from the ledger's is marked. Columns are plan steps: the head view, a view from its side, the plan text and the failure codes.
 """
 
 from __future__ import annotations

@@ -158,7 +158,7 @@ def rows_of(
     Args:
         records: of one run.
         categories: rows before the last.
-        references: what path lengths, steps and luck are measured against; nothing by default.
+        references: what path lengths, steps and contingencies are measured against; nothing by default.
     """
     known = references or References()
     valid = [record for record in records if record.outcome is not Outcome.INFRASTRUCTURE_ERROR]

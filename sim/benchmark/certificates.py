@@ -26,7 +26,7 @@ CERTIFICATES_PATH: Final = BENCHMARK_PATH.with_name("certificates.jsonl")
 #: Steps beyond the family's typical number that a certified plan may take.
 _EXTRA_STEPS: Final = 6
 #: Stances that a certified plan may need to try in thought; only draws that fail in the end need more, and long for it.
-_REHEARSALS: Final = 12
+_LOOKAHEADS: Final = 12
 
 
 class Refusal(ValueError):  # noqa: N818 - it reports that a draw is no task of the benchmark
@@ -104,7 +104,7 @@ def certify(
     session = Session(robot, "easy", image_size=0, step_limit=step_limit)
     try:
         session.reset(task, seed=task.seed)
-        expert = Expert(session, _REHEARSALS if len(arms) == len(Arm) else None, arms)
+        expert = Expert(session, _LOOKAHEADS if len(arms) == len(Arm) else None, arms)
         expert.reset()
         while not session.finished:
             session.step(expert.next_step())

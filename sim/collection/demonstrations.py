@@ -59,7 +59,7 @@ class Teacher(Protocol):
 _SEEDS_PER_COLLECTION: Final = 1_000_000
 #: The expert gives an episode up when it has thought about this many stances: four fifths of the time went into episodes that
 #: failed in the end and were dropped.
-_REHEARSALS: Final = 6
+_LOOKAHEADS: Final = 6
 #: Lessons and those of a student take their tasks from here on, so that they share none with the expert's own; the steps after
 #: which one ends; shares of steps that are mistakes, one drawn per lesson.
 _LESSONS_FROM: Final = 700_000
@@ -103,7 +103,7 @@ def run_episode(config: CollectConfig, index: int, sessions: dict[tuple[str, str
     """
     rng = rng_for("demos", config.seed, index)
     robot, task, session, observation = _start(config, index, rng, {} if sessions is None else sessions)
-    expert = Expert(session, rehearsals=_REHEARSALS)
+    expert = Expert(session, lookaheads=_LOOKAHEADS)
     expert.reset()
     episode = Episode()
     while not session.finished:

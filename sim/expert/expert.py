@@ -23,7 +23,7 @@ from interface.effects import PutDown
 from interface.failures import FailureCode
 from interface.steps import Action, PlanStep
 from sim.expert.jobs import Job, Setting, plan_jobs
-from sim.expert.lookahead import HEIGHT_STEP_M, Rehearsal
+from sim.expert.lookahead import HEIGHT_STEP_M, Lookahead
 from sim.session.session import Session
 from sim.skills.failures import SkillFailure
 from sim.skills.navigation import Stance, wrap_angle
@@ -37,7 +37,7 @@ _STANCES: Final[tuple[tuple[float | None, float | None], ...]] = (
 )  # fmt: skip
 _TURN_STEP_DEG: Final = 15.0
 #: Stances that are tried in thought before each walk, and walks before the expert gives up.
-_REHEARSED: Final = 4
+_LOOKED_AHEAD: Final = 4
 _PATIENCE: Final = 5
 #: Changes of height that are tried at one stance before another stance is.
 _HEIGHT_TRIALS: Final = 2
@@ -58,7 +58,7 @@ _TOGETHER_M: Final = 0.9
 _FAR_M: Final = 1.1
 #: Names of actions that change the stance or the height.
 _MOVES: Final = ("GoTo", "Move", "Rotate")
-#: Failures that the physics, not bad luck, decided: the same action from the same place would fail again.
+#: Failures that the physics, not a contingency, decided: the same action from the same place would fail again.
 _FRUITLESS: Final = tuple(
     code.value
     for code in (
@@ -103,19 +103,19 @@ class _Memory:
         attempts: how often a way was tried.
         refusals: what does not work from where.
         gone: stances tried, by target.
-        rehearsed: stances tried in thought.
+        looked_ahead: stances tried in thought.
         barren: what was tried in thought from where, in vain.
     """
 
     attempts: dict[str, int] = field(default_factory=dict)
     refusals: list[_Refusal] = field(default_factory=list)
     gone: dict[str, set[str]] = field(default_factory=dict)
-    rehearsed: int = 0
+    looked_ahead: int = 0
     barren: list[tuple[str, _Place]] = field(default_factory=list)
 
     def copy(self) -> _Memory:
         gone = {target: set(tried) for target, tried in self.gone.items()}
-        return _Memory(dict(self.attempts), list(self.refusals), gone, self.rehearsed, list(self.barren))
+        return _Memory(dict(self.attempts), list(self.refusals), gone, self.looked_ahead, list(self.barren))
 
 
 class Expert:
@@ -128,22 +128,22 @@ class Expert:
 
     privileged: Final = True
 
-    def __init__(self, session: Session, rehearsals: int | None = None, arms: Sequence[Arm] = (Arm.RIGHT, Arm.LEFT)) -> None:
+    def __init__(self, session: Session, lookaheads: int | None = None, arms: Sequence[Arm] = (Arm.RIGHT, Arm.LEFT)) -> None:
         """Attaches to a session.
 
         Args:
             session: the robot in its world.
-            rehearsals: stances it may try in thought in an episode before it gives up; no limit when None.
+            lookaheads: stances it may try in thought in an episode before it gives up; no limit when None.
             arms: the arms it uses; with one of them it shows what a one-armed robot could do.
         """
         self._session = session
-        self._rehearsals = rehearsals
+        self._lookaheads = lookaheads
         self._usable = tuple(arms)
         self._memory, self._before = _Memory(), _Memory()
         self._homes: dict[str, str] = {}
         self._proposed = ""
         self.intent: Action | None = None
-        self._rehearsal = Rehearsal(session)
+        self._lookahead = Lookahead(session)
 
     def reset(self) -> None:
         """Forgets earlier attempts; call after the session's reset."""
@@ -231,7 +231,7 @@ class Expert:
             if code in _FRUITLESS:
                 self._memory.refusals.append(_Refusal(text, self._here(), None))
             elif code == "ok" and not text.startswith(_MOVES):
-                self._memory = _Memory(rehearsed=self._memory.rehearsed)
+                self._memory = _Memory(looked_ahead=self._memory.looked_ahead)
             elif code == "ok" and other:  # the robot was moved: every stance is as good as new
                 self._memory.attempts.clear()
                 self._memory.gone.clear()
@@ -308,12 +308,12 @@ class Expert:
         following = self._follow_up(job, arm)
         if following is None:
             return True
-        return following.arm in self._usable and self._rehearsal.leads_to(job.action(arm), following)
+        return following.arm in self._usable and self._lookahead.leads_to(job.action(arm), following)
 
     def _lasts(self, step: PlanStep) -> bool:
         """Whether what both hands put down stays there; it is put down in thought first, since it is lost when it falls."""
         both = any(action.spec.arms == 2 and action.spec.has_effect(PutDown) for action in step.actions)
-        return not both or self._rehearsal.succeeds(step)
+        return not both or self._lookahead.succeeds(step)
 
     def _approach_for_two(self, job: Job, at: Setting) -> Action:
         """The body action towards a place from where one arm can do a job and the other what follows it."""
@@ -321,16 +321,16 @@ class Expert:
         pairs = [(first, then) for first, then in pairs if then is not None and then.arm in self._usable]
         if not pairs or self._count(f"stance {job.target}") >= _PATIENCE:
             return Action("Done")
-        present, *heights = self._rehearsal.heights_m()
+        present, *heights = self._lookahead.heights_m()
         tried = self._memory.gone.setdefault(job.target, set())
         trials = 0
         for option, stance in self._stances_for_two(job.target, tried):
             for height in (present, *heights) if option is not None else heights:
                 for first, then in pairs:
-                    if not self._rehearsal.might_lead_to(first, then, stance, height):
+                    if not self._lookahead.might_lead_to(first, then, stance, height):
                         continue
                     trials += 1
-                    if self._rehearsal.leads_to(first, then, stance, height):
+                    if self._lookahead.leads_to(first, then, stance, height):
                         tried.add("" if option is None else option.to_text())
                         return self._height_change(height - present) if option is None else option
                     if trials >= _ACTED_OUT:
@@ -342,7 +342,7 @@ class Expert:
         yield None, self._session.body.posture.stance()
         for distance, bearing in _STANCES:
             option = Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
-            stance = None if option.to_text() in tried else self._rehearsal.stance_of(option)
+            stance = None if option.to_text() in tried else self._lookahead.stance_of(option)
             if stance is not None:
                 yield option, stance
 
@@ -362,8 +362,8 @@ class Expert:
         for target in dict.fromkeys((head.target, partner.target)):
             for distance, bearing in _STANCES[:3]:
                 option = Action("GoTo", object_id=target, amount=distance, bearing_deg=bearing)
-                stance = self._rehearsal.stance_of(option)
-                if stance is not None and self._rehearsal.works_together(pairs, stance):
+                stance = self._lookahead.stance_of(option)
+                if stance is not None and self._lookahead.works_together(pairs, stance):
                     return option
         return None
 
@@ -422,19 +422,19 @@ class Expert:
         fresh = [option for option in options if option.to_text() not in tried]
         looked, what = 0, " or ".join(action.to_text() for action in actions)
         for option in fresh:
-            if looked == _REHEARSED:
+            if looked == _LOOKED_AHEAD:
                 break
-            if self._rehearsals is not None and self._memory.rehearsed >= self._rehearsals:
+            if self._lookaheads is not None and self._memory.looked_ahead >= self._lookaheads:
                 return Action("Done")
-            stance = self._rehearsal.stance_of(option)
+            stance = self._lookahead.stance_of(option)
             if stance is None:
                 continue
             place = _Place(stance, self._session.body.posture.pelvis_height_m)
             if any(what == known and place.near(other) for known, other in self._memory.barren):
                 continue
             looked += 1
-            self._memory.rehearsed += 1
-            if self._rehearsal.works(actions, stance):
+            self._memory.looked_ahead += 1
+            if self._lookahead.works(actions, stance):
                 tried.add(option.to_text())
                 return option
             self._memory.barren.append((what, place))

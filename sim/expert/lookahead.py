@@ -28,7 +28,7 @@ _TOGETHER: Final = 3
 _PULLED_OPEN: Final = 0.95
 
 
-class Rehearsal:
+class Lookahead:
     """Questions to one session."""
 
     def __init__(self, session: Session) -> None:
@@ -78,7 +78,7 @@ class Rehearsal:
         return False
 
     def succeeds(self, step: PlanStep) -> bool:
-        """Whether a step taken here and now goes well, bad luck apart: it is acted out and undone."""
+        """Whether a step taken here and now goes well, contingencies apart: it is acted out and undone."""
         with self._session.imagining():
             return self._session.act(step, diagnose=False).success
 

@@ -173,7 +173,7 @@ class Controller(Stopped):
         width: of the frames, pixels.
         height: likewise.
         difficulty: easy, medium, hard or natural.
-        seed: key of the trial's luck.
+        seed: key of the trial's contingencies.
         third_party_cameras: names of `sim.world.rendering.CAMERAS` drawn with every event.
         privileged: allows TP, GetInteractablePoses, SetObjectPoses and InitialRandomSpawn.
         task: start from a task instead of the room's default.

@@ -66,7 +66,7 @@ class Controller(Stopped):
         robot_type: `h1` or `x1`.
         scene: DualTHOR's scene name, or a room of ours.
         difficulty: easy, medium, hard or natural; DualTHOR's rates are `natural`.
-        seed: key of the luck.
+        seed: key of the contingencies.
         image_folder: where a picture is written after every step; None writes none.
         image_size: its side, pixels.
 
@@ -115,7 +115,7 @@ class Controller(Stopped):
         """Executes one action, or two of them as `actions=[...]` with `executionMode` parallel or sequential."""
         call: dict[str, Any] = dict(action) if isinstance(action, Mapping) else {"action": action}
         call |= arguments
-        call.pop("successRate", None)  # luck is the contingencies' matter here
+        call.pop("successRate", None)  # contingencies decide that here
         try:
             if "actions" in call:
                 return self._several(call)

@@ -139,7 +139,7 @@ class Controller(own.Stopped):
         rotateStepDegrees: default turn.
         autoApproach: whether an action walks up to what is out of reach, and changes the pelvis height.
         difficulty: easy, medium, hard or natural.
-        seed: key of the luck.
+        seed: key of the contingencies.
         fieldOfView: of the head camera, vertical, degrees; the robot's own when it is None.
         options: those of `UNUSED`, which have no use here.
 

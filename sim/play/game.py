@@ -48,7 +48,7 @@ class PlayConfig:
         room: room name; ignored with a task.
         task: id of a benchmark task; None plays freely in the room.
         difficulty: easy, medium, hard or natural.
-        seed: key of the trial's luck.
+        seed: key of the trial's contingencies.
         port: of the page, on this machine alone; 0 takes a free one.
         speed: simulated seconds per second while the robot acts.
         browser: whether to open the page.

@@ -1,8 +1,8 @@
-"""Bad luck, seeded: outcome distributions of skills by object type and state, and the three difficulties.
+"""Contingencies, seeded: outcome distributions of skills by object type and state, and the three difficulties.
 
 A draw is a pure function of (seed, step, action, object): every planner that does the same thing at the same step of the same
-trial meets the same luck, and no generator has to be carried around or saved. Outcomes are drawn after an action has proved
-geometrically and logically possible; the skill then acts them out in the physics.
+trial meets the same contingencies, and no generator has to be carried around or saved. Outcomes are drawn after an action has
+proved geometrically and logically possible; the skill then acts them out in the physics.
 
 Paper: stochastic contingencies (the cup with 80/10/10 success, spilled, broken) and the difficulties easy, medium, hard with
 100, 50 and 20 % success of low-level skills. Body movements are not subject to contingencies here: the paper's table of rates
@@ -100,12 +100,12 @@ def _uniform(seed: int, step: int, action: str, object_id: str) -> float:
 
 @dataclass(frozen=True)
 class Contingency:
-    """The luck of one trial.
+    """The contingencies of one trial.
 
     Attributes:
         config: rules and difficulties.
         difficulty: a key of `config.difficulties`.
-        seed: key of the trial's luck.
+        seed: key of the trial's contingencies.
     """
 
     config: ContingencyConfig

@@ -1,8 +1,8 @@
 """One robot in one room with one task: reset, step, observe, judge, save and restore.
 
 A session is what planners are run against and what the Gymnasium environment and the AI2-THOR-style controller wrap. It owns
-the world, the trial's luck, what the robot has seen so far, the history and the running statistics. Everything that a later
-step depends on is part of `snapshot()`, so restoring and repeating gives bit-equal results.
+the world, the trial's contingencies, what the robot has seen so far, the history and the running statistics. Everything that a
+later step depends on is part of `snapshot()`, so restoring and repeating gives bit-equal results.
 
 Paper: problem formulation (observation, dual-arm action, feedback), undo and redo of DualTHOR.
 """
@@ -124,7 +124,7 @@ class SessionStats:
 
     @property
     def charged(self) -> int:
-        """Steps that count towards the limits: these bound what is planned, not the luck, so struck ones do not."""
+        """Steps that count towards the limits: these bound what is planned, not contingencies, so struck ones do not."""
         return self.steps - self.struck
 
     @property
@@ -196,7 +196,7 @@ class Session:
 
         Args:
             task: what is to be done and where.
-            seed: key of the trial's luck; the scene itself follows from the task.
+            seed: key of the trial's contingencies; the scene itself follows from the task.
         """
         self.close()
         joints: dict[str, float] = {}

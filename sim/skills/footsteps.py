@@ -112,10 +112,13 @@ class Footsteps:
     def __init__(self, kit: RobotKit) -> None:
         self._kit = kit
         self._legs = tuple(_Leg(kit, side) for side in ("left", "right"))
+        self._reaches = lru_cache(maxsize=64)(self._reach_at)
 
-    @lru_cache(maxsize=64)  # noqa: B019  # two robots live as long as the process
     def reach_m(self, pelvis_height_m: float) -> tuple[float, float]:
         """How far both soles can be ahead and back, and to either side, of their neutral place on the floor."""
+        return self._reaches(round(pelvis_height_m, 3))
+
+    def _reach_at(self, pelvis_height_m: float) -> tuple[float, float]:
         shares = _SHARES * self._kit.spec.standing_pelvis_height_m
         neutral = self._neutral(pelvis_height_m)
         found = []

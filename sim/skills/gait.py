@@ -34,7 +34,7 @@ def leg_motion(feet: Footsteps, pelvis_height_m: float, soles_m: Array, way: Arr
         soles_m: (2, 2) x and y of the left and the right sole of the standing robot, pelvis heading frame.
         way: (T, 3) commanded x, y (m) and yaw (rad, not wrapped), the present pose first.
     """
-    longest_m = 2.0 * np.array(feet.reach_m(round(pelvis_height_m, 3)))  # ahead, aside
+    longest_m = 2.0 * np.array(feet.reach_m(pelvis_height_m))  # ahead, aside
     moved = np.linalg.norm(_in_heading(np.diff(way[:, :2], axis=0), way[1:, 2]) / longest_m, axis=1)
     turned = np.abs(np.diff(way[:, 2])) / _TURN_RAD
     progress = np.concatenate([[0.0], np.cumsum(np.maximum(moved, turned))])  # (T,) in longest steps

@@ -11,6 +11,7 @@ Constants were chosen by hand; with them the certificates of the 359 benchmark t
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -145,32 +146,29 @@ def _carry(body: Body, arm: Arm, held: str) -> Array:
     What holds a liquid is carried where the arm holds it upright, which may be farther ahead.
     """
     usual = carrying_posture(body.kit, arm)
-    _, hand = body.arms.hand_pose(arm)
-    turn = upright(body.world.poses.pose(held)[:3, :3])
-    pointing, closing = turn @ hand[:, 0], turn @ hand[:, 1]
-    ahead = body.posture.turn_to_world(np.array([1.0, 0.0, 0.0]))
-    if np.hypot(*pointing[:2]) > 0.15:
-        about = _turn_z(float(np.arctan2(ahead[1], ahead[0]) - np.arctan2(pointing[1], pointing[0])))
-        pointing, closing = about @ pointing, about @ closing
-    place_at = body.ik.hand_at(arm, usual)
-    solved = body.ik.solve(arm, HandPose(place_at, pointing, closing), start=usual, roll_weight=0.2)
+    object_in_world, hand_in_world = body.world.poses.pose(held)[:3, :3], body.arms.hand_pose(arm)[1]
+    upright_hand = upright(object_in_world) @ hand_in_world  # in the world
+    ahead_in_world = body.posture.turn_to_world(np.array([1.0, 0.0, 0.0]))
+    if np.hypot(*upright_hand[:2, 0]) > 0.15:
+        azimuth_rad = float(np.arctan2(*ahead_in_world[1::-1]) - np.arctan2(*upright_hand[1::-1, 0]))
+        upright_hand = _turn_z(azimuth_rad) @ upright_hand
+    carried = HandPose(body.ik.hand_at(arm, usual), upright_hand[:, 0], upright_hand[:, 1])
+    solved = body.ik.solve(arm, carried, start=usual, roll_weight=0.2)
     otherwise = solved.q if solved.error_m < 0.05 else usual
     if body.obj(held).state.fillLitres <= 0.0 and body.probe.own_depth_m(body.obj(held), {arm: otherwise}) <= OFF_BODY_M:
         return otherwise
-    up = hand.T @ body.world.poses.pose(held)[:3, 2]
-    return _level(body, arm, body.obj(held), up, HandPose(place_at, pointing, closing), otherwise)
+    return _level(body, arm, body.obj(held), hand_in_world.T @ object_in_world[:, 2], carried, otherwise)
 
 
 def _level_way(body: Body, arm: Arm, held: str, goal: Array) -> list[Array]:
     """(A,) postures on the hand's straight way to carrying on which a vessel stays upright, as far as they exist."""
-    start, end = body.arms.hand_pose(arm)[0], body.ik.hand_at(arm, goal)
-    hand = body.arms.hand_pose(arm)[1]
-    turn = upright(body.world.poses.pose(held)[:3, :3])
-    pointing, closing = turn @ hand[:, 0], turn @ hand[:, 1]
+    (start_m, hand_in_world), end_m = body.arms.hand_pose(arm), body.ik.hand_at(arm, goal)
+    upright_hand = upright(body.world.poses.pose(held)[:3, :3]) @ hand_in_world
     way: list[Array] = []
     last = body.arms.commanded(arm)
     for share in (0.25, 0.5, 0.75):
-        solved = body.ik.solve(arm, HandPose(start + share * (end - start), pointing, closing), start=last, roll_weight=0.2)
+        target = HandPose(start_m + share * (end_m - start_m), upright_hand[:, 0], upright_hand[:, 1])
+        solved = body.ik.solve(arm, target, start=last, roll_weight=0.2)
         if solved.error_m < 0.05 and body.probe.free(arm, [solved.q]):
             last = solved.q
             way.append(last)
@@ -189,29 +187,27 @@ def shift_hand(body: Body, arm: Arm, change: Array) -> Skill:
         yield from body.arms.move(arm, [goal.q], speed=0.6)
 
 
-def _level(body: Body, arm: Arm, obj: ObjectInstance, up: Array, near: HandPose, otherwise: Array) -> Array:
-    """(A,) posture near a hand pose in which an object whose axis is `up` in the hand stands upright, or most nearly so.
+def _level(body: Body, arm: Arm, obj: ObjectInstance, up_in_hand: Array, near: HandPose, otherwise: Array) -> Array:
+    """(A,) posture near a hand pose in which an object whose axis is `up_in_hand` stands upright, or most nearly so.
 
     The object is off the robot's own body there.
     """
     best: tuple[float, Array] | None = None
     ahead, left = body.posture.turn_to_world(np.array([1.0, 0.0, 0.0])), body.posture.turn_to_world(np.array([0.0, 1.0, 0.0]))
     outward = left if arm is Arm.LEFT else -left
-    for forward in (0.0, 0.08, 0.16):
-        for rise in (0.0, -0.1, 0.1, -0.2):
-            for aside in (0.0, 0.08):
-                point = near.position + forward * ahead + aside * outward + rise * _UP
-                goal = body.ik.solve(arm, HandPose(point, near.pointing, near.closing), roll_weight=0.2)
-                axes = np.stack([goal.pointing, goal.closing, np.cross(goal.pointing, goal.closing)], axis=1)
-                tilt = float(np.arccos(np.clip((axes @ up)[2], -1.0, 1.0)))
-                if goal.error_m > 0.05 or not body.probe.free(arm, [goal.q]):
-                    continue
-                if body.probe.own_depth_m(obj, {arm: goal.q}) > OFF_BODY_M:
-                    continue
-                if best is None or tilt < best[0] - 0.02:
-                    best = (tilt, goal.q)
-                if tilt < _LEVEL_RAD:
-                    return goal.q
+    for ahead_m, up_m, aside_m in itertools.product((0.0, 0.08, 0.16), (0.0, -0.1, 0.1, -0.2), (0.0, 0.08)):
+        point = near.position + ahead_m * ahead + aside_m * outward + up_m * _UP
+        goal = body.ik.solve(arm, HandPose(point, near.pointing, near.closing), roll_weight=0.2)
+        hand_in_world = np.stack([goal.pointing, goal.closing, np.cross(goal.pointing, goal.closing)], axis=1)
+        tilt_rad = float(np.arccos(np.clip((hand_in_world @ up_in_hand)[2], -1.0, 1.0)))
+        if goal.error_m > 0.05 or not body.probe.free(arm, [goal.q]):
+            continue
+        if body.probe.own_depth_m(obj, {arm: goal.q}) > OFF_BODY_M:
+            continue
+        if best is None or tilt_rad < best[0] - 0.02:
+            best = (tilt_rad, goal.q)
+        if tilt_rad < _LEVEL_RAD:
+            return goal.q
     return otherwise if best is None else best[1]
 
 
@@ -364,35 +360,35 @@ def plan_bring(
     Raises:
         SkillFailure: TooFar, BodyTooHigh, BodyTooLow or Obstructed.
     """
-    position, hand = body.arms.hand_pose(arm)
-    pose = body.world.poses.pose(obj.object_id)
-    # the object upright again, turned about the vertical only
-    tilt = upright(pose[:3, :3])
-    middle = pose[:3, 3] if point is None else pose[:3, 3] + pose[:3, :3] @ point
-    offset = tilt @ (middle - position)  # object frame from the hand
-    pointing, closing = tilt @ hand[:, 0], tilt @ hand[:, 1]
-    lowest = _lowest(obj, tilt @ pose[:3, :3])
-    if point is not None:
-        lowest -= float((tilt @ pose[:3, :3] @ point)[2])
+    hand_m, hand_in_world = body.arms.hand_pose(arm)
+    object_in_world = body.world.poses.pose(obj.object_id)
+    # everything below is in world axes, the object upright again and turned about the vertical only
+    righting = upright(object_in_world[:3, :3])
+    point_from_origin = np.zeros(3) if point is None else object_in_world[:3, :3] @ point
+    point_from_hand = righting @ (object_in_world[:3, 3] + point_from_origin - hand_m)
+    upright_hand = righting @ hand_in_world
+    lowest_m = _lowest(obj, righting @ object_in_world[:3, :3]) - float((righting @ point_from_origin)[2])
+    lift = np.array([0.0, 0.0, above_m - lowest_m])
     shoulder = body.posture.shoulder(arm)
-    lift = np.array([0.0, 0.0, above_m - lowest])
     ways = [(touched, extra) for touched in ((ignore,) if clear is None else (clear, ignore)) for extra in _TURNS]
 
     def search(body: Body) -> tuple[Array, Reach, Array]:
         for spot in spots:
-            sight = spot[:2] - shoulder[:2]
             # keep the hand's azimuth relative to the line of sight, or turn the object a little
-            now = float(np.arctan2(pointing[1], pointing[0])) if np.hypot(*pointing[:2]) > 0.15 else None
-            straight = 0.0 if now is None else float(np.arctan2(sight[1], sight[0])) - now
-            for touched, extra in ways:
-                turn = _turn_z(straight + extra)
-                hand_target = HandPose(spot + lift - turn @ offset, turn @ pointing, turn @ closing)
-                reach = plan_reach(body, arm, hand_target, coming_from, from_m, touched, pointing=0.9, closing=0.93)
+            straight_rad = 0.0
+            if np.hypot(*upright_hand[:2, 0]) > 0.15:
+                sight = spot[:2] - shoulder[:2]
+                straight_rad = float(np.arctan2(*sight[::-1]) - np.arctan2(*upright_hand[1::-1, 0]))
+            for touched, extra_rad in ways:
+                turn = _turn_z(straight_rad + extra_rad)
+                turned = turn @ upright_hand
+                target = HandPose(spot + lift - turn @ point_from_hand, turned[:, 0], turned[:, 1])
+                reach = plan_reach(body, arm, target, coming_from, from_m, touched, pointing=0.9, closing=0.93)
                 if reach is not None:
-                    return spot, reach, -(turn @ pointing)
+                    return spot, reach, -turned[:, 0]
         raise SkillFailure(FailureCode.OBSTRUCTED)
 
-    return diagnosed(body, {arm: spots[0] + lift - offset}, search)
+    return diagnosed(body, {arm: spots[0] + lift - point_from_hand}, search)
 
 
 def place(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:

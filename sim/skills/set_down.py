@@ -104,7 +104,7 @@ def assess_place_both(body: Body, action: Action) -> BothPlacement:
     try:
         return search(body)
     except SkillFailure:
-        way = load.above(spots[0])[:3, 3] - load.turned[:3, 3]
+        way = load.above(spots[0])[:3, 3] - load.turned_in_world[:3, 3]
         raise diagnose(body, {arm: body.arms.hand_pose(arm)[0] + way for arm in Arm}, search) from None
 
 
@@ -119,46 +119,48 @@ class _Load:
 
     Attributes:
         obj: the object.
-        pose: where it is.
-        turned: as it is put down: as it is, or turned upright between the hands where it leans too much for that.
-        grasps: per arm the hand in the object's frame.
+        object_in_world: where it is.
+        turned_in_world: as it is put down: as it is, or turned upright between the hands where it leans too much for that.
+        hands_in_object: per arm.
         sole_m: how far its lowest point is below its origin as it is put down.
         bottom_m: height of its lowest point now.
     """
 
     obj: ObjectInstance
-    pose: Array
-    turned: Array
-    grasps: Mapping[Arm, Array]
+    object_in_world: Array
+    turned_in_world: Array
+    hands_in_object: Mapping[Arm, Array]
     sole_m: float
     bottom_m: float
 
     @classmethod
     def of(cls, body: Body, obj: ObjectInstance) -> _Load:
         """What is held now."""
-        pose = body.world.poses.pose(obj.object_id)
-        hands = {arm: _pose(*body.arms.hand_pose(arm)) for arm in Arm}
+        object_in_world = body.world.poses.pose(obj.object_id)
+        hands_in_world = {arm: _pose(*body.arms.hand_pose(arm)) for arm in Arm}
         bottom_m = float(body.world.poses.bounds(obj.object_id)[0][2])
-        turned, sole_m = pose, float(pose[2, 3]) - bottom_m
-        if float(np.arccos(np.clip(pose[2, 2], -1.0, 1.0))) > _LEANING_RAD:
-            middle = 0.5 * (hands[Arm.LEFT][:3, 3] + hands[Arm.RIGHT][:3, 3])
-            turn = upright(pose[:3, :3])
-            turned = _pose(middle + turn @ (pose[:3, 3] - middle), turn @ pose[:3, :3])
+        turned_in_world, sole_m = object_in_world, float(object_in_world[2, 3]) - bottom_m
+        if float(np.arccos(np.clip(object_in_world[2, 2], -1.0, 1.0))) > _LEANING_RAD:
+            middle = 0.5 * (hands_in_world[Arm.LEFT][:3, 3] + hands_in_world[Arm.RIGHT][:3, 3])
+            turn = upright(object_in_world[:3, :3])
+            turned_in_world = _pose(middle + turn @ (object_in_world[:3, 3] - middle), turn @ object_in_world[:3, :3])
             sole_m = -float(obj.local_min[2])
-        return cls(obj, pose, turned, {arm: np.linalg.inv(pose) @ hand for arm, hand in hands.items()}, sole_m, bottom_m)
+        world_in_object = np.linalg.inv(object_in_world)
+        hands_in_object = {arm: world_in_object @ hand for arm, hand in hands_in_world.items()}
+        return cls(obj, object_in_world, turned_in_world, hands_in_object, sole_m, bottom_m)
 
-    def hands(self, pose: Array) -> dict[Arm, HandPose]:
-        """Where the hands are when the object is at a pose."""
-        found = {arm: pose @ grasp for arm, grasp in self.grasps.items()}
+    def hands(self, object_in_world: Array) -> dict[Arm, HandPose]:
+        """Where the hands are, world frame, when the object is at a pose."""
+        found = {arm: object_in_world @ hand for arm, hand in self.hands_in_object.items()}
         return {arm: HandPose(hand[:3, 3], hand[:3, 0], hand[:3, 1]) for arm, hand in found.items()}
 
     def above(self, point: Array) -> Array:
         """The object's pose with its lowest point at the height of a point (3,) and its origin over it."""
-        return _pose(point + self.sole_m * _UP, self.turned[:3, :3])
+        return _pose(point + self.sole_m * _UP, self.turned_in_world[:3, :3])
 
     def sunk_m(self, tilt_rad: float) -> float:
         """How much lower its lowest point is when it leans ahead or back between the hands."""
-        held_m = float(np.mean([grasp[2, 3] for grasp in self.grasps.values()])) - float(self.obj.local_min[2])
+        held_m = float(np.mean([hand[2, 3] for hand in self.hands_in_object.values()])) - float(self.obj.local_min[2])
         depth_m = float(np.min((self.obj.local_max - self.obj.local_min)[:2]))
         return max(0.0, 0.5 * depth_m * float(np.sin(tilt_rad)) - held_m * (1.0 - float(np.cos(tilt_rad))))
 
@@ -180,10 +182,12 @@ def _raised(body: Body, load: _Load, level_m: float, higher_m: float, lean_rad: 
         higher_m: how much higher the load comes with the pelvis height under consideration.
         lean_rad: how much it may lean more than it is meant to; without a bound nothing depends on the raise.
     """
-    present_m = float(load.turned[2, 3]) - load.sole_m + higher_m
+    present_m = float(load.turned_in_world[2, 3]) - load.sole_m + higher_m
     for extra_m in _EXTRA_M:
         bottom_m = max(level_m, present_m) + extra_m
-        goal = body.ik.solve_both(load.hands(load.above(np.array([*load.turned[:2, 3], bottom_m]))), body.arms.commanded_both())
+        goal = body.ik.solve_both(
+            load.hands(load.above(np.array([*load.turned_in_world[:2, 3], bottom_m]))), body.arms.commanded_both()
+        )
         if goal.error_m > BOTH_TOLERANCE_M or goal.tilt_rad > lean_rad:
             continue
         if np.isinf(lean_rad) or bottom_m - load.sunk_m(goal.tilt_rad) >= level_m - _EDGE_M:
@@ -195,10 +199,10 @@ def _height_over(body: Body, load: _Load, spot: Array) -> float | None:
     """How high above a spot the load passes over what is before it, None where there is something on every way."""
     for over_m in _OVER_M:
         end = load.above(spot + over_m * _UP)
-        top, start = load.turned.copy(), load.pose.copy()
+        top, start = load.turned_in_world.copy(), load.object_in_world.copy()
         top[2, 3] = max(end[2, 3], top[2, 3])
-        start[2, 3] += top[2, 3] - load.turned[2, 3]
-        up = body.probe.load_depths_m(load.obj, _between(load.pose, start))
+        start[2, 3] += top[2, 3] - load.turned_in_world[2, 3]
+        up = body.probe.load_depths_m(load.obj, _between(load.object_in_world, start))
         across = body.probe.load_depths_m(load.obj, _between(top, end))
         if max(up) <= max(up[0], TOUCH_M) and max(across) <= _SHOVE_M:
             return over_m

@@ -52,7 +52,7 @@ class VideoConfig:
         fps: pictures per simulated second, at most 50.
         pretty: a lamp with shadows and smooth edges, but in the head's pictures, which stay what a planner sees.
         difficulty: easy, medium, hard or natural.
-        seed: key of the luck.
+        seed: key of the contingencies.
     """
 
     out: str

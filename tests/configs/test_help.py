@@ -60,7 +60,7 @@ def test_meanings_come_from_the_docstrings() -> None:
     assert text.startswith("About.\n")
     line = text[text.index("  trials=1 ") :].splitlines()[:2]
     assert " ".join(" ".join(line).split()) == (
-        "trials=1 episodes per task; the luck and the random streams differ between trials."
+        "trials=1 episodes per task; the contingencies and the random streams differ between trials."
     )
     assert "[easy, medium, hard, natural]" in text.replace("\n" + " " * 44, " ")
     assert "learning rate" in help_text("train", TrainConfig, "")

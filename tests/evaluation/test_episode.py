@@ -93,7 +93,7 @@ def test_what_only_repeats_itself_is_ended_as_stuck(session, scripted, fields) -
     assert ended(*["gibberish"] * 60).steps == 8
     varied = ended(*["RotateLeft(45)", "RotateRight(45)", "RotateLeft(5)"] * 20)
     assert (varied.stuck, varied.budget_exhausted, varied.steps) == (False, True, 50)
-    # who moves, or has bad luck that may change, is not stuck
+    # who moves, or meets contingencies that may change, is not stuck
     walks = run_episode(lambda: session(drift=0.1), scripted(*["MoveAhead(0.1)"] * 60), fields, "x", Limits(6, 50, 8), 5)
     assert walks.budget_exhausted
     unlucky = ended("GoTo(Mug_1)", "MoveDown(0.2)", *["Pick(left, Mug_1)"] * 60, unlucky=20)

@@ -112,7 +112,7 @@ def test_other_settings_are_other_episodes(cfg) -> None:
     assert plan_episodes(cfg, tasks, "w")[0].fields != plan_episodes(cfg, tasks, "v")[0].fields
     turned = dataclasses.replace(cfg, start="turned")
     assert run_folder(turned, "w") != run_folder(cfg, "w")
-    # The planner is not part of the luck.
+    # The planner is not part of the contingencies.
     other = dataclasses.replace(cfg, planner=dataclasses.replace(cfg.planner, name="other"))
     assert plan_episodes(other, tasks, "w")[0].episode_seed == plan_episodes(cfg, tasks, "w")[0].episode_seed
 

@@ -1,4 +1,4 @@
-"""Episodes in the real simulator: the same luck gives the same episode, and a strip acts it out again."""
+"""Episodes in the real simulator: the same contingencies give the same episode, and a strip acts it out again."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A planner sees observations only: with everything else of the simulator scrambled, what it asks and answers is the same.
 
 An episode is run and what the planner was shown is kept. In a second one the planner is shown the same, while the simulator
-behind it has every object and joint somewhere else, other goals and other luck. The expert, which looks, is caught.
+behind it has every object and joint somewhere else, other goals and other contingencies. The expert, which looks, is caught.
 """
 
 from __future__ import annotations

@@ -110,7 +110,7 @@ def test_the_gap_is_one_planner_on_two_bodies(pair) -> None:
     result = compare_bodies(*pair(second=bodies))
     assert result.kind == "bodies"
     assert result.rows["all"]["success"].difference == pytest.approx(4 / 12)
-    assert "the luck of their trials is not" in " ".join(comparison_table(result).notes)
+    assert "the contingencies of their trials are not" in " ".join(comparison_table(result).notes)
 
 
 def test_command_line(pair, capsys, tmp_path) -> None:

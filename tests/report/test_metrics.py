@@ -60,7 +60,7 @@ INVALID = ("", False, "")
     ("trace", "expected"),
     [
         ([], []),
-        ([step(TOO_FAR), step(INVALID)], []),  # failures without bad luck are no events
+        ([step(TOO_FAR), step(INVALID)], []),  # failures without a contingency are no events
         ([step(SLIPPED)], [False]),
         ([step(SLIPPED), step(GOT)], [True]),  # the other arm makes it good
         ([step(GOT), step(SLIPPED)], [False]),  # an earlier success does not

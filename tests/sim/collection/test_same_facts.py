@@ -23,8 +23,6 @@ from sim.world.facts import world_facts
 TASKS = load_benchmark()
 #: Families with tools, liquids, two-handed loads and doors that fall shut.
 FAMILIES = ("slice_steady", "store_ajar", "carry", "clean", "use_up", "fetch_two", "pick_and_toggle_on")
-#: A mug that Place reports as set down while it is still falling over the edge.
-KNOWN = {("x1", "benchmark_tidy_three_30404")}
 
 
 @dataclass
@@ -121,4 +119,4 @@ def test_physics_and_table_change_the_same_facts_in_families_of_training_too(fam
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", PAPER_ROBOTS)
 def test_physics_and_table_change_the_same_facts_in_many_tasks(robot: str) -> None:
-    assert sum(compared(robot, task) for task in TASKS[5::6] if (robot, task.id) not in KNOWN) > 300
+    assert sum(compared(robot, task) for task in TASKS[5::9]) > 200

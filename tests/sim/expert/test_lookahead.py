@@ -6,7 +6,7 @@ import pytest
 from interface.bodies import Arm
 from interface.steps import Action
 from sim.expert.expert import Expert
-from sim.expert.lookahead import Rehearsal
+from sim.expert.lookahead import Lookahead
 from sim.session.session import Session
 from sim.tasks.sample import sample_task
 
@@ -33,28 +33,28 @@ def _ways(session):
 
 
 def test_a_drawer_is_imagined_open_before_it_is_opened_in_thought(session):
-    rehearsal, (first, then) = Rehearsal(session), _ways(session)
+    lookahead, (first, then) = Lookahead(session), _ways(session)
     here = session.body.posture.stance()
-    stances = [rehearsal.stance_of(Action("GoTo", object_id=DRAWER, bearing_deg=b)) for b in (None, -20.0, 20.0)]
+    stances = [lookahead.stance_of(Action("GoTo", object_id=DRAWER, bearing_deg=b)) for b in (None, -20.0, 20.0)]
     before, openness = session.world.data.qpos.copy(), session.world.objects[DRAWER].openness
     asked = {
         (number, height): (
-            rehearsal.might_lead_to(first, then, stance, height),
-            rehearsal.leads_to(first, then, stance, height),
+            lookahead.might_lead_to(first, then, stance, height),
+            lookahead.leads_to(first, then, stance, height),
         )
         for number, stance in enumerate(stances)
         if stance is not None
-        for height in rehearsal.heights_m()[:3]
+        for height in lookahead.heights_m()[:3]
     }
     assert any(acted for _, acted in asked.values()), asked
     assert all(might or not acted for might, acted in asked.values()), "nothing is ruled out that works"
-    assert not rehearsal.might_lead_to(first, then, here, session.body.posture.pelvis_height_m), "too far away from here"
+    assert not lookahead.might_lead_to(first, then, here, session.body.posture.pelvis_height_m), "too far away from here"
     assert session.world.objects[DRAWER].openness == openness < 0.02
     assert np.array_equal(session.world.data.qpos, before)
 
 
 def test_two_arms_together_need_both_targets_in_reach(session):
-    rehearsal, (first, then) = Rehearsal(session), _ways(session)
-    assert not rehearsal.works_together([(first, then)], session.body.posture.stance())
-    stance = rehearsal.stance_of(Action("GoTo", object_id=DRAWER))
-    assert not rehearsal.works_together([(first, then)], stance), "what is shut cannot be filled"
+    lookahead, (first, then) = Lookahead(session), _ways(session)
+    assert not lookahead.works_together([(first, then)], session.body.posture.stance())
+    stance = lookahead.stance_of(Action("GoTo", object_id=DRAWER))
+    assert not lookahead.works_together([(first, then)], stance), "what is shut cannot be filled"

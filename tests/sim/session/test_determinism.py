@@ -16,7 +16,7 @@ PLAN = ("GoTo(SoapBottle_1)", "Pick(left, SoapBottle_1)", "MoveBack(0.2)", "Togg
 
 
 def fingerprint(robot: str) -> str:
-    """Hash of positions, outcomes and the last picture of a short episode with luck."""
+    """Hash of positions, outcomes and the last picture of a short episode with contingencies."""
     session = Session(robot, "natural", image_size=64, all_known=True)
     session.reset(FreePlay("bathroom_1"), seed=11)
     digest = hashlib.sha256()

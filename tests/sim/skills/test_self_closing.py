@@ -59,6 +59,6 @@ def test_imagined_steps_leave_no_trace() -> None:
     before = session.world.save()
     with session.imagining():
         assert session.act(PlanStep.parse("GoTo(Drawer_1)")).success
-        assert session.draw(Action.parse("Open(left, Drawer_1)")) == "success", "no bad luck in thought"
+        assert session.draw(Action.parse("Open(left, Drawer_1)")) == "success", "no contingency in thought"
     assert session.history == () and session.stats.steps == 0
     assert (session.world.data.qpos == before.physics.qpos).all()
