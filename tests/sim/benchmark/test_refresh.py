@@ -13,7 +13,7 @@ from interface.bodies import PAPER_ROBOTS
 from sim.benchmark import commands
 from sim.benchmark.certificates import Certificate, load_certificates
 from sim.benchmark.commands import main, stale_note
-from sim.benchmark.refresh import drift, refresh, solve_again
+from sim.benchmark.refresh import _new, drift, refresh, solve_again
 from sim.scene.compiler import PHYSICS
 from sim.tasks.task import Task, load_benchmark
 
@@ -43,6 +43,13 @@ def test_a_refused_task_makes_room_for_a_fresh_draw_and_the_rest_is_not_solved_a
     assert [(proof.task, proof.robot) for proof in proofs] == [(task.id, robot) for task in tasks for robot in PAPER_ROBOTS]
     assert {proof.physics for proof in proofs if proof.task == fresh.id} == {PHYSICS}
     assert replaced == [f"{gone.id}: x1 does not solve it; {fresh.id} stands in"]
+
+
+def test_a_draw_that_stands_in_for_one_task_stands_in_for_no_other() -> None:
+    first, others = TASKS[0], TASKS[1:]
+    assert _new(first, others)
+    assert not _new(first, TASKS)
+    assert not _new(dataclasses.replace(first, seed=-1), TASKS), "nor does one with the same words"
 
 
 def test_another_family_stands_as_it_is(tmp_path: Path) -> None:
