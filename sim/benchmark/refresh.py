@@ -86,7 +86,7 @@ def refresh(
         found = pool.map(_stand_in, refused, [tuple(standing)] * len(refused))
         for task, drawn in tqdm(zip(refused, found, strict=True), total=len(refused), desc="stand-ins", unit="task"):
             if drawn is not None and not _new(drawn[0], standing):  # it stands in for another one already
-                drawn = _stand_in(task, standing)
+                drawn = _stand_in(task, standing, drawn[0])
             if drawn is None:
                 raise RuntimeError(f"{task.id} is solved no more, and no seed of {task.family} stands in for it")
             _keep(kept, task, robots, drawn)
@@ -124,11 +124,10 @@ def drift(task: Task, old: Sequence[Certificate], now: Solved) -> Iterator[str]:
                 yield f"{task.id} on {before.robot}: {arm} arm alone {again} steps, certified {steps}"
 
 
-def _stand_in(task: Task, others: Sequence[Task]) -> tuple[Task, tuple[Certificate, ...]] | None:
-    """The first draw that may take a task's place beside others, with its certificates."""
-    for room, seed in more_seeds(task):
-        if seed == task.seed:
-            continue
+def _stand_in(task: Task, others: Sequence[Task], after: Task | None = None) -> tuple[Task, tuple[Certificate, ...]] | None:
+    """The first draw, or the first after a given one, that may take a task's place beside others, with its certificates."""
+    draws = [draw for draw in more_seeds(task) if draw[1] != task.seed]
+    for room, seed in draws if after is None else draws[draws.index((after.room, after.seed)) + 1 :]:
         try:
             fresh = sample_task(seed, room, task.family, "benchmark")
             if _new(fresh, others):
