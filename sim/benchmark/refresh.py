@@ -64,7 +64,7 @@ def refresh(
     workers: int,
     kept: Path,
 ) -> tuple[list[Task], list[Certificate], list[str]]:
-    """Tasks and certificates with the present physics, and what was replaced.
+    """Tasks and certificates with the present physics, and what was replaced; those that have it already stand.
 
     Args:
         tasks: the whole benchmark.
@@ -77,7 +77,8 @@ def refresh(
     Raises:
         RuntimeError: when no seed stands in for a task; the message names it.
     """
-    chosen = [task for task in tasks if family in (None, task.family)]
+    stale = {proof.task for proof in certificates if proof.stale}
+    chosen = [task for task in tasks if task.id in stale and family in (None, task.family)]
     again = dict(zip((task.id for task in chosen), solve_again(chosen, certificates, robots, workers, kept), strict=True))
     solved = {name: now for name, now in again.items() if not isinstance(now, str)}
     refused = [task for task in chosen if task.id not in solved]

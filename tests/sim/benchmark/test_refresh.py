@@ -18,7 +18,11 @@ from sim.scene.compiler import PHYSICS
 from sim.tasks.task import Task, load_benchmark
 
 TASKS = tuple(task for task in load_benchmark() if task.family == "pick")
-PROOFS = tuple(proof for proof in load_certificates() if proof.task in {task.id for task in TASKS})
+PROOFS = tuple(
+    dataclasses.replace(proof, physics=PHYSICS - 1)
+    for proof in load_certificates()
+    if proof.task in {task.id for task in TASKS}
+)
 
 
 def kept(path: Path, refused: str = "", **change: object) -> Path:
@@ -50,6 +54,11 @@ def test_a_draw_that_stands_in_for_one_task_stands_in_for_no_other() -> None:
     assert _new(first, others)
     assert not _new(first, TASKS)
     assert not _new(dataclasses.replace(first, seed=-1), TASKS), "nor does one with the same words"
+
+
+def test_certificates_of_the_present_physics_stand(tmp_path: Path) -> None:
+    present = [dataclasses.replace(proof, physics=PHYSICS) for proof in PROOFS]
+    assert refresh(TASKS, present, PAPER_ROBOTS, None, 1, tmp_path / "none.jsonl") == (list(TASKS), present, [])
 
 
 def test_another_family_stands_as_it_is(tmp_path: Path) -> None:
