@@ -18,7 +18,7 @@ def test_an_episode_is_filmed_from_its_trace(acted_run: Path, tmp_path: Path, ca
     frames = np.asarray(iio.imread(out, plugin="pyav"))
     assert f"{len(frames)} frames" in capsys.readouterr().out
     (record,) = load_run(acted_run).records
-    held_s = 0.5 + 0.8 * (record.steps + 1)  # the instruction, every step, the outcome
+    held_s = 0.5 + 0.8 * (record.steps + 1) + 1.0  # the instruction, every step, the outcome; things come to rest
     assert len(frames) / 5 == pytest.approx(held_s + record.makespan_s, abs=0.8)
     moving = np.abs(np.diff(frames[:, :48].astype(int), axis=0)).mean(axis=(1, 2, 3)) > 0.05
     assert moving.sum() > 0.5 * 5 * record.makespan_s, "frames between the steps"
