@@ -270,9 +270,13 @@ class Session:
     def _settle(self, text: str) -> None:
         """Lets things come to rest before the goals are read: what is about to fall is not where it should be."""
         for _ in range(round(_SETTLE_S / CONTROL_DT_S)):
-            self.world.advance(CONTROL_DT_S)
-            for watch in self.watchers:
-                watch(self.world, text)
+            self._tick(text)
+
+    def _tick(self, text: str) -> None:
+        """Lets physics run for one control tick and shows it to the watchers."""
+        self.world.advance(CONTROL_DT_S)
+        for watch in self.watchers:
+            watch(self.world, text)
 
     def _run(self, step: PlanStep, diagnose: bool) -> Feedback:
         known = frozenset(self.known_objects)
@@ -291,12 +295,10 @@ class Session:
 
         def advance() -> None:
             nonlocal place, path
-            self.world.advance(CONTROL_DT_S)
+            self._tick(text)
             now = self.body.base.measured().position
             path += float(np.linalg.norm(now - place))
             place = now
-            for watch in self.watchers:
-                watch(self.world, text)
 
         outcomes = run_skills(skills, advance)
         if path > 0.01:  # less is the servos' tremor

@@ -203,7 +203,7 @@ class ClearanceProbe:
         touching[limb] = True
         a, b = scratch.contact.geom[: scratch.ncon].T
         counts = (touching[a] != touching[b]) & barred[np.where(touching[a], b, a)]
-        depth = max(0.0, float(-np.min(scratch.contact.dist[: scratch.ncon][counts], initial=0.0)))
+        depth = _deepest_m(scratch, counts)
         site = self._joints.grasp_sites[arm]
         bones = np.stack([*scratch.xpos[self._bones[arm]], scratch.site_xpos[site]])
         return AtDoor(gap, depth, bones, scratch.geom_xpos[self._hands[arm]].copy())
@@ -246,7 +246,7 @@ class ClearanceProbe:
             mujoco.mj_collision(model, scratch)
             a, b = scratch.contact.geom[: scratch.ncon].T
             counts = (load[a] != load[b]) & barred[np.where(load[a], b, a)]
-            depths.append(max(0.0, float(-np.min(scratch.contact.dist[: scratch.ncon][counts], initial=0.0))))
+            depths.append(_deepest_m(scratch, counts))
         return np.array(depths)
 
     def own_depth_m(self, obj: ObjectInstance, arms: Mapping[Arm, Array], waist: Array | None = None) -> float:
@@ -276,7 +276,7 @@ class ClearanceProbe:
         load, own = np.isin(np.arange(model.ngeom), obj.geom_ids), model.geom_contype == OWN_BIT
         a, b = scratch.contact.geom[: scratch.ncon].T
         counts = (load[a] & own[b]) | (load[b] & own[a])
-        return max(0.0, float(-np.min(scratch.contact.dist[: scratch.ncon][counts], initial=0.0)))
+        return _deepest_m(scratch, counts)
 
     def finger_gaps_m(self, arm: Arm, geoms: NDArray[np.int64]) -> tuple[float, float]:
         """Distance of each of the two opposing finger groups to some geoms, in the world as it is, negative inside."""
@@ -307,6 +307,11 @@ class ClearanceProbe:
                     continue
                 best = min(best, float(mujoco.mj_geomDistance(model, data, int(a), int(b), best, None)))
         return best
+
+
+def _deepest_m(data: mujoco.MjData, counts: NDArray[np.bool_]) -> float:
+    """Deepest penetration of the contacts that count (ncon,)."""
+    return max(0.0, float(-np.min(data.contact.dist[: data.ncon][counts], initial=0.0)))
 
 
 def _limb_geoms(model: mujoco.MjModel, joint: str) -> frozenset[int]:
