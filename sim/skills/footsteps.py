@@ -137,7 +137,7 @@ class Footsteps:
         return max(float(found[0]), least), max(min(float(found[1]), 0.5 * apart), least)
 
     def joints(self, pelvis_height_m: float, feet: Array) -> Array:
-        """(N, L) leg joints for displaced feet.
+        """(N, L) leg joints for displaced feet of one motion: successive poses are close to each other.
 
         Args:
             pelvis_height_m: pelvis above the floor.

@@ -60,6 +60,28 @@ def test_soles_are_where_the_gait_puts_them(robot: str) -> None:
         assert np.linalg.norm(missed, axis=1).max() < 0.012
 
 
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("share", [0.15, 0.5, 0.9])
+def test_both_soles_come_as_far_as_the_reach_says_and_feet_stay_apart(robot: str, share: float) -> None:
+    kit = robot_kit(robot)
+    low, high = kit.spec.pelvis_height_range_m
+    height_m = low + share * (high - low)
+    steps, names = footsteps(kit), ("left_sole", "right_sole")
+    reach_m = steps.reach_m(height_m)
+    feet = np.zeros((4, 2, 4))
+    for number, (axis, sign) in enumerate(((0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0))):
+        feet[number, :, axis] = sign * reach_m[axis]
+    base, index = kit.crouches.posture(height_m), kit.model.indices(kit.spec.leg_joints)
+    root = np.array([0.0, 0.0, height_m, *root_quaternion(0.0, kit.crouches.pitch(height_m))])
+    neutral = kit.model.frames(root, base, names)[:, :3, 3]
+    for wanted in feet:
+        q = base.copy()
+        q[index] = steps.joints(height_m, wanted[None])[0]
+        missed = kit.model.frames(root, q, names)[:, :3, 3] - neutral - wanted[:, :3]
+        assert np.linalg.norm(missed, axis=1).max() < 0.006
+    assert neutral[0, 1] - neutral[1, 1] - 2.0 * reach_m[1] > 2.0 * kit.spec.foot.half_width_m
+
+
 def ways() -> dict[str, np.ndarray]:
     steps = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 120))
     zero = np.zeros(120)
