@@ -35,8 +35,9 @@ TIMESTEP_S: Final = 0.005
 #: Version of the physics, raised with each change after which the same plan may end otherwise (models, contacts, solver,
 #: motions of skills). Certificates, runs and tables say with which one they were made. 1: sparse Jacobians where MuJoCo chooses
 #: them; 2: dense ones; 3: grasps that hold, fingers at rest, loads that do not fly, set-downs that last; 4: feet that stand,
-#: decisions of two ticks, what is held meets the robot's own body, goals read when things have come to rest.
-PHYSICS: Final = 4
+#: decisions of two ticks, what is held meets the robot's own body, goals read when things have come to rest;
+#: 5: who is too low to step rises to walk, what is held ends a walk as a hand does.
+PHYSICS: Final = 5
 BASE_JOINTS: Final = ("base_x", "base_y", "base_z", "base_yaw", "base_pitch")
 STATIC_BITS: Final = (1, 0)
 MOVABLE_BITS: Final = (2, 23)

@@ -25,7 +25,7 @@ _TURN_RAD: Final = 0.45
 _LIFT: Final = 0.045
 
 
-def leg_motion(feet: Footsteps, pelvis_height_m: float, soles_m: Array, way: Array) -> Array:
+def leg_motion(feet: Footsteps, pelvis_height_m: float, soles_m: Array, way: Array, rise_m: Array) -> Array:
     """(T, L) leg joints that walk along a path of the base.
 
     Args:
@@ -33,8 +33,9 @@ def leg_motion(feet: Footsteps, pelvis_height_m: float, soles_m: Array, way: Arr
         pelvis_height_m: pelvis above the floor.
         soles_m: (2, 2) x and y of the left and the right sole of the standing robot, pelvis heading frame.
         way: (T, 3) commanded x, y (m) and yaw (rad, not wrapped), the present pose first.
+        rise_m: (T,) how much higher the pelvis is meanwhile.
     """
-    longest_m = 2.0 * np.array(feet.reach_m(pelvis_height_m))  # ahead, aside
+    longest_m = 2.0 * np.array(feet.reach_m(pelvis_height_m + float(rise_m.max())))  # ahead, aside
     moved = np.linalg.norm(_in_heading(np.diff(way[:, :2], axis=0), way[1:, 2]) / longest_m, axis=1)
     turned = np.abs(np.diff(way[:, 2])) / _TURN_RAD
     progress = np.concatenate([[0.0], np.cumsum(np.maximum(moved, turned))])  # (T,) in longest steps
@@ -67,6 +68,7 @@ def leg_motion(feet: Footsteps, pelvis_height_m: float, soles_m: Array, way: Arr
             shifts[ticks, foot, :2] = _in_heading(poses[:, :2] - way[ticks, :2], way[ticks, 2]) - soles_m[foot]
             shifts[ticks, foot, 3] = poses[:, 2] - way[ticks, 2]
         places[swinging] = landing
+    shifts[:, :, 2] -= rise_m[:, None]
     return feet.joints(pelvis_height_m, shifts)
 
 

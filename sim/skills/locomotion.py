@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from interface.bodies import Arm
 from interface.failures import FailureCode
 from interface.steps import Action
+from sim.skills.body.base import Walk
 from sim.skills.body.body import Body
 from sim.skills.failures import SkillFailure
 from sim.skills.navigation import NavigationMap, Stance, wrap_angle
@@ -105,28 +106,22 @@ def _travel(body: Body, way: NDArray[np.float64], limits: NDArray[np.float64] = 
         return
     start = body.posture.stance()
     way = np.concatenate([[(start.x, start.y, start.yaw_rad)], way])  # (T + 1, 3)
-    bases, legs = body.base.walking_targets(way)
+    walk = body.base.walk(way)
     limits, stops = np.maximum(limits, body.contacts.pushed() + 0.5 * _PUSHED), TwoTicks()
     for tick in range(1, len(way)):
-        body.base.command(*map(float, bases[tick]))
-        body.base.place_legs(legs[tick])
+        walk.command(tick)
         yield
         if stops(bool(np.any(body.contacts.pushed() > limits))):
-            yield from _retreat(body, way[: tick + 1], legs)
+            yield from _retreat(body, walk, way[: tick + 1])
             walked = float(np.linalg.norm(body.posture.stance().position - start.position))
             raise SkillFailure(FailureCode.BLOCKED_PATH, {"travel_m": walked})
 
 
-def _retreat(body: Body, way: NDArray[np.float64], legs: NDArray[np.float64]) -> Skill:
-    """Goes back along a way until nothing presses, a third of a second at most, and brings the feet together."""
-
-    def command(tick: int) -> None:
-        body.base.command(*map(float, way[tick]))
-        body.base.place_legs(legs[tick])
-
-    tick = yield from _go_back(body, len(way) - 1, command)
+def _retreat(body: Body, walk: Walk, way: NDArray[np.float64]) -> Skill:
+    """Goes back along a way (T, 3) until nothing presses, a third of a second at most, and brings the feet together."""
+    tick = yield from _go_back(body, len(way) - 1, lambda earlier: walk.command(earlier, way[earlier]))
     for share in np.linspace(0.0, 1.0, round(0.3 / CONTROL_DT_S))[1:]:
-        body.base.place_legs((1.0 - share) * legs[tick] + share * legs[0])
+        walk.stand(tick, float(share))
         yield
 
 
@@ -196,13 +191,12 @@ def sweep(body: Body, arm: Arm, postures: NDArray[np.float64], stances: NDArray[
         return np.column_stack([np.interp(travelled, shares, column) for column in rows.T])  # (N, D) -> (T, D)
 
     arms = between(postures)
-    walking = body.base.walking_targets(between(stances)) if bool(np.any(np.ptp(stances, axis=0) > 1e-6)) else None
+    moves = bool(np.any(np.ptp(stances, axis=0) > 1e-6))
+    walk = body.base.walk(between(stances), rises=False) if moves else None
     for k in range(1, steps + 1):
         body.arms.command(arm, arms[k])
-        if walking is not None:
-            bases, legs = walking
-            body.base.command(*map(float, bases[k]))
-            body.base.place_legs(legs[k])
+        if walk is not None:
+            walk.command(k)
         yield
 
 

@@ -33,7 +33,8 @@ class Contacts:
         """(3,) how strongly obstacles push the robot.
 
         How deep it presses (m), how far the hands' joints are bent beyond their limits (rad, and m / 0.2 of sliding ones), and
-        how far an arm's joint is from its target (rad), which is what yields first; 0 for the last one while nothing touches.
+        how far an arm's joint is from its target (rad), which is what yields first; 0 for the last one while nothing touches
+        the robot or what one hand holds; a load in both hands brushes along what it is set on.
         """
         model, data = self._world.model, self._world.data
         depth_m, touches = self._pressed()
@@ -69,18 +70,19 @@ class Contacts:
         return False
 
     def _pressed(self) -> tuple[float, bool]:
-        """How deep the robot presses into anything that it does not hold, metres, and whether it touches anything."""
+        """How deep the robot presses into what it does not hold, metres, and whether it, or what a hand holds, touches it."""
         data = self._world.data
         if data.ncon == 0:
             return 0.0, False
-        owner = self._contact_owner()[data.contact.geom[: data.ncon]]  # (C, 2): 1 robot, 0 held, -1 else
-        touching = np.prod(owner, axis=1) < 0
-        return float(-np.min(data.contact.dist[: data.ncon][touching], initial=0.0)), bool(touching.any())
+        owner = self._contact_owner()[data.contact.geom[: data.ncon]]  # (C, 2): 2 robot, 1 in one hand, 0 in both, -1 else
+        touched = np.min(owner, axis=1) < 0
+        pressed, caught = touched & (np.max(owner, axis=1) == 2), touched & (np.max(owner, axis=1) >= 1)
+        return float(-np.min(data.contact.dist[: data.ncon][pressed], initial=0.0)), bool(caught.any())
 
     def _contact_owner(self) -> NDArray[np.int64]:
-        """(ngeom,) 1 for the robot's geoms, 0 for those of what it holds, -1 for all others."""
-        owner = self._mine.copy()
+        """(ngeom,) 2 for the robot's geoms, 1 for those of what one hand holds, 0 for what both hold, -1 for all others."""
+        owner = np.where(self._mine > 0, 2, -1)
         for obj in self._world.objects.values():
             if obj.held_by:
-                owner[obj.geom_ids] = 0
+                owner[obj.geom_ids] = 2 - len(obj.held_by)
         return owner

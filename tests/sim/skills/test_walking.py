@@ -30,7 +30,7 @@ def soles_on(robot: str, height_m: float, way: np.ndarray) -> np.ndarray:
         return local @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (pose[0], pose[1], 0.0)
 
     neutral = soles(np.zeros(3), base)[:, :2]
-    legs = leg_motion(footsteps(kit), height_m, neutral, way)
+    legs = leg_motion(footsteps(kit), height_m, neutral, way, np.zeros(len(way)))
     found = []
     for pose, joints in zip(way, legs, strict=True):
         q = base.copy()
@@ -132,7 +132,7 @@ def test_walking_moves_the_legs_and_leaves_them_as_they_were(robot: str) -> None
     np.testing.assert_allclose(after, before, atol=1e-3)
 
 
-@pytest.mark.parametrize(("robot", "down_m"), [("h1", 0.1), ("x1", 0.05)])
+@pytest.mark.parametrize(("robot", "down_m"), [("h1", 0.1), ("h1", 0.33), ("x1", 0.05), ("x1", 0.18)])
 def test_the_standing_foot_stays_where_it_is(robot: str, down_m: float) -> None:
     session = Session(robot, image_size=0, all_known=True)
     session.reset(FreePlay("living_room_1", placements=()), 0)
