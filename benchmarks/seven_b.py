@@ -14,6 +14,7 @@ Point maps come from the small encoder of this project unless `train` gives CUT3
 from __future__ import annotations
 
 import dataclasses
+import gc
 import statistics
 import subprocess
 import sys
@@ -22,12 +23,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 from transformers import Qwen2_5_VLForConditionalGeneration
 
+import train
 from configs.arguments import command, read_arguments
 from configs.compose import compose
 from configs.schema.model import ModelConfig
@@ -44,6 +47,7 @@ from proprio_mllm.training.alignment import PHASES
 from proprio_mllm.training.loop import make_optimizer
 from proprio_mllm.training.memory import spare_memory
 from proprio_mllm.training.pipeline import Pipeline, variant_model
+from proprio_mllm.training.processes import processes
 from proprio_mllm.training.stages import STAGES
 from proprio_mllm.training.stages.inputs import lessons_of, turns_of
 
@@ -64,6 +68,7 @@ class Options:
         steps: timed steps, with and without MPE and CSE each.
         peak: TFLOP/s of the device at its best, for the share that is used; 0 leaves that out.
         folder: for weights, data and models; what is there goes on.
+        until: the last stage that runs first, `alignment` or `selu`.
     """
 
     model: str = "qwen2_5_vl_7b"
@@ -73,6 +78,7 @@ class Options:
     steps: int = 8
     peak: float = 0.0
     folder: str = "outputs/seven_b"
+    until: Literal["alignment", "selu"] = "selu"
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,7 @@ def random_weights(model: ModelConfig, folder: Path) -> Path:
         for name in ("image_token_id", "video_token_id", "vision_start_token_id", "vision_end_token_id"):
             setattr(config, name, getattr(ours, name))
         torch.set_default_dtype(getattr(torch, model.dtype))
-        with new_folder(folder) as work:
+        with new_folder(folder) as work, torch.device("cuda" if torch.cuda.is_available() else "cpu"):
             Qwen2_5_VLForConditionalGeneration(config).save_pretrained(str(work))
             processor.save_pretrained(str(work))
         torch.set_default_dtype(torch.float32)
@@ -164,14 +170,15 @@ def measured(options: Options, cfg: TrainConfig) -> list[str]:
     pipeline = Pipeline(STAGES, cfg, lessons=Lessons(cfg.data.robots))
     folder = pipeline.paths.model("alignment")
     model, motion = load_model(folder, trainable=True), load_motion(folder)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    model.to(device)
+    model.to(processes().device)
+    if torch.cuda.is_available():
+        torch.cuda.reset_peak_memory_stats()
     demos = lessons_of(pipeline, model.cfg)
     turns = turns_of(pipeline, model, demos, motion)
     rng = np.random.default_rng(cfg.seed)
     drawn = [turns.draw(rng, options.batch) for _ in range(_WARM + options.steps)]
     collators = Collator(model.processor, model.cfg), Collator(model.processor, plain(model))
-    batches = [(collators[0](rows).to(device), collators[1](rows).to(device)) for rows in drawn]
+    batches = [(collators[0](rows).to(model.device), collators[1](rows).to(model.device)) for rows in drawn]
     train_only(model, PHASES["joint"].groups)
     spare_memory(model, cfg.recompute, cfg.shard)
     model.train()
@@ -212,14 +219,20 @@ def main(arguments: Sequence[str]) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     words = settings(options, folder)
     began = time.monotonic()
-    done = subprocess.run([sys.executable, "train.py", "stage=all", *words], cwd=ROOT, check=False)
-    if done.returncode:
-        return done.returncode
     cfg = build(TrainConfig, compose("train", words))
+    stages = Pipeline(STAGES, cfg).ancestors(options.until)
+    for stage in ("data", "collect"):  # whose processes need no more than the simulator
+        done = subprocess.run([sys.executable, "train.py", f"stage={stage}", *words], cwd=ROOT, check=False)
+        if done.returncode:
+            return done.returncode
+    for stage in stages:
+        if train.job(dataclasses.replace(cfg, stage=stage)):
+            return 1
+        gc.collect()
     name = torch.cuda.get_device_name() if torch.cuda.is_available() else f"{torch.get_num_threads()} threads"
     print(f"{options.model} on {name}, torch {torch.__version__}, {'random' if options.weights is None else 'given'} weights")
     paths = Pipeline(STAGES, cfg).paths
-    spent = {stage: read_json(paths.stage(stage) / "done.json")["metrics"]["seconds"] for stage in STAGES}
+    spent = {stage: read_json(paths.stage(stage) / "done.json")["metrics"]["seconds"] for stage in stages}
     told = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in spent.items())
     print(f"all stages, a few steps each: {time.monotonic() - began:.0f} s ({told})")
     for line in measured(options, cfg):

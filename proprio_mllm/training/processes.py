@@ -8,6 +8,7 @@ gradient has none in any process. With one process nothing of this does anything
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Sequence
 from datetime import timedelta
 from functools import cache
@@ -25,7 +26,12 @@ _PATIENCE = timedelta(days=7)
 
 @cache
 def processes() -> PartialState:
-    """This process among all; joins them when it is first asked for."""
+    """This process among all; joins them when it is first asked for, and from then on GPUs add in the same order every time."""
+    if torch.cuda.is_available():
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+        torch.use_deterministic_algorithms(True, warn_only=True)
+        torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]  # torch has no stub for it
+        torch.backends.cuda.enable_cudnn_sdp(False)  # whose gradients keep no order
     return PartialState(cpu=not torch.cuda.is_available(), timeout=_PATIENCE)
 
 

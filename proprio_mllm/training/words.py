@@ -255,9 +255,8 @@ def held_out_metrics(model: ProprioMLLM, sources: Mapping[str, Source], count: i
     found: dict[str, float] = {}
     for ending, episode in sources.items():
         objective = WordsObjective(model, lambda seed, made=episode: made(-1 - seed % 2**31), "")
-        values = [
-            objective.loss(model, part, torch.Generator())[1] for part in objective.batch(np.random.default_rng(0), count)
-        ]
+        parts = objective.batch(np.random.default_rng(0), count)
+        values = [objective.loss(model, part.to(model.device), torch.Generator())[1] for part in parts]
         found[f"held_out_loss{ending}"] = sum(value["answers"] for value in values)
         found[f"held_out_exact{ending}"] = sum(value["exact"] for value in values)
     return found

@@ -40,7 +40,7 @@ class Line(Objective):
 
     def loss(self, module: nn.Module, batch: Tensor, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
         self.seen += 1
-        noise = torch.randn(len(batch), 1, generator=generator) * 0.1
+        noise = torch.randn(len(batch), 1, generator=generator).to(batch.device) * 0.1
         loss = (module(batch) - batch.sum(1, keepdim=True) + noise).square().mean()
         return loss * float("nan") if self.bad else loss, {"extra": 1.0}
 

@@ -32,6 +32,7 @@ def launched(count: int, folder: Path, micro_batches: int, *more: str, module: s
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     shared = {"WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "PYTHONPATH": str(ROOT)}
+    shared["CUDA_VISIBLE_DEVICES"] = ""  # more processes than there may be GPUs
     command = [sys.executable, "-m", module, str(folder), str(micro_batches), *more]
     running = [
         subprocess.Popen(

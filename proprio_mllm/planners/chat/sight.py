@@ -86,7 +86,7 @@ class _Encoder:
         import torch
 
         with self._lock, torch.inference_mode():
-            vectors = np.stack([self._features(image).float().numpy() for image in images])  # (N, D)
+            vectors = np.stack([self._features(image).float().cpu().numpy() for image in images])  # (N, D)
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
         return (vectors / np.maximum(lengths, 1e-12)).astype(np.float32)
 
