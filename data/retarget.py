@@ -182,13 +182,6 @@ class Retargeter:
         motion = Motion(human.name, self.spec.name, FPS, features, captions, root, joints)
         return Retargeted(motion, human, targets)
 
-    def measured_points(self, result: Retargeted) -> Measured:
-        """Points of the robot in every frame of a retargeted clip."""
-        motion = result.motion
-        assert motion.root_pose is not None
-        assert motion.joint_positions is not None
-        return self.measured_joints(motion.root_pose, motion.joint_positions)
-
     def measured_joints(self, root_pose: Array, joints: Array) -> Measured:
         """Points of the robot for root poses (T, 7) and joint vectors (T, J)."""
         frames = len(root_pose)

@@ -53,12 +53,6 @@ class CrouchTable:
         """Leg joints (L,) at a height, in the order of `spec.leg_joints`."""
         return np.array([np.interp(pelvis_height_m, self.heights_m, column) for column in self._leg_table.T])
 
-    def soles_ahead_m(self, pelvis_height_m: float) -> float:
-        """How far the soles' centres are ahead of the pelvis, so that the base can shift and leave the feet where they are."""
-        height = self.clamp(pelvis_height_m)
-        root = np.array([0.0, 0.0, height, *root_quaternion(0.0, self.pitch(height))])
-        return float(self.robot.frames(root, self.apply(self._posture, height), ("left_sole", "right_sole"))[:, 0, 3].mean())
-
     def apply(self, q: Array, pelvis_height_m: float) -> Array:
         """Copy of `q` (J,) with the legs of this height."""
         out = np.array(q, dtype=float)

@@ -27,13 +27,6 @@ class Reach:
     shortfall_m: Array
     reached: NDArray[np.bool_]
 
-    @property
-    def best_height_m(self) -> float:
-        """The highest pelvis that reaches the point, or the one that comes nearest."""
-        if self.reached.any():
-            return float(self.heights_m[self.reached].max())
-        return float(self.heights_m[np.argmin(self.shortfall_m)])
-
 
 def reach_over_heights(
     kit: RobotKit, arm: str, point_in_base: Array, rotation: Array | None = None, heights: int = 5, restarts: int = 1

@@ -160,11 +160,6 @@ class MotionTokenizerConfig:
         """Different motion tokens."""
         return self.codes * self.codebooks
 
-    @property
-    def window_tokens(self) -> int:
-        """Tokens of one proprioception window."""
-        return self.window // self.stride * self.codebooks
-
 
 @dataclass(frozen=True)
 class TinyTextConfig:

@@ -66,12 +66,6 @@ def _offsets(cells: int, place: float) -> Tensor:
     return (delta.sign() * (delta.abs() - LEVEL).ceil().clamp_min(0)).long()
 
 
-def degenerate(h: int, w: int, centroid: Centroid) -> tuple[bool, bool]:
-    """Whether the vertical and the horizontal sign is the same for all tokens, so that it tells them nothing apart."""
-    signs = relative_cells(h, w, centroid).sign()
-    return bool((signs[0] == signs[0, 0]).all()), bool((signs[1] == signs[1, 0]).all())
-
-
 def visual_positions(mode: MpeMode, start: int, h: int, w: int, centroid: Centroid | None) -> tuple[Tensor, int]:
     """Ids (3, N) of an image's tokens and the next text position, see the table above.
 

@@ -10,7 +10,7 @@ columns, h and w rows and columns of the tokens, C token channels.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -30,16 +30,6 @@ class GeoFeatures:
     tokens: Tensor | None
     points_m: Tensor
     conf: Tensor
-
-
-class PointMapEncoder(Protocol):
-    """Anything that turns images into `GeoFeatures`; `token_dim` is C, 0 without tokens."""
-
-    token_dim: int
-
-    def __call__(self, rgb: Tensor, points_m: Tensor | None = None) -> GeoFeatures:
-        """`rgb` is (I, 3, H, W) uint8 or float in [0, 255]; `points_m` are true points, which only the oracle reads."""
-        ...
 
 
 def _pixels(rgb: Tensor) -> Tensor:

@@ -7,15 +7,13 @@ would vanish from decoded text.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 from transformers import AddedToken, PreTrainedTokenizerBase
 
 MOTION_START = "<motion_start>"
 MOTION_END = "<motion_end>"
 MOTION_MASK = "<motion_mask>"
-_CODE = re.compile(r"<motion_(\d{1,6})>")
 
 
 def motion_tokens(codes: int) -> tuple[str, ...]:
@@ -45,16 +43,3 @@ def motion_text(codes: Iterable[int | None]) -> str:
     """A window of codes as text between the delimiters; None becomes the mask token."""
     inner = "".join(MOTION_MASK if code is None else f"<motion_{int(code)}>" for code in codes)
     return f"{MOTION_START}{inner}{MOTION_END}"
-
-
-def parse_motion(text: str, codes: int) -> tuple[int, ...]:
-    """The codes in a text, in order.
-
-    Raises:
-        ValueError: on a code outside the codebook.
-    """
-    found: Sequence[int] = [int(match) for match in _CODE.findall(text)]
-    for code in found:
-        if code >= codes:
-            raise ValueError(f"motion code {code} outside the codebook [0, {codes})")
-    return tuple(found)

@@ -17,8 +17,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -66,17 +65,6 @@ _MOVING_ARMATURE: Final = 0.02
 _LIGHT_ARMATURE: Final = 0.004
 #: Friction of a lid's hinge, harder than usual, which creeps; much harder, and the solver does not converge and the lid sinks.
 _LID_SOLIMP: Final = (0.97, 0.98, 0.001, 0.5, 2.0)
-
-
-class RobotForScene(Protocol):
-    """What a scene needs of a robot: `robots.spec.RobotSpec` has it."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def mjcf_path(self) -> Path: ...
-    @property
-    def root_body(self) -> str: ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ import torch
 from interface.bodies import KEY_BODIES
 from interface.observation import Camera
 from proprio_mllm.model.geometry import arm_length_m, body_point_in_pelvis, centroid, project, unproject
-from proprio_mllm.model.mpe import MPE_MODES, SignEmbedding, degenerate, position_ids, relative_cells, visual_positions
+from proprio_mllm.model.mpe import MPE_MODES, SignEmbedding, position_ids, relative_cells, visual_positions
 
 PAD = 9
 
@@ -117,12 +117,6 @@ def test_signs_are_steady_when_the_robot_looks_straight_ahead():
     for noise in (-1e-12, 1e-12):
         assert torch.equal(relative_cells(4, 4, (0.5 + noise, 0.64)), exact)
     assert exact[1].reshape(4, 4)[0].tolist() == [-2, -1, 1, 2]
-
-
-def test_degenerate_axes():
-    assert degenerate(4, 4, (0.5, 0.64)) == (False, False)
-    assert degenerate(4, 4, (0.5, 1.4)) == (True, False)
-    assert degenerate(4, 4, (-1.0, 2.0)) == (True, True)
 
 
 def test_far_and_infinite_centroids():

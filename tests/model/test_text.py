@@ -14,7 +14,14 @@ from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.chat import Message, encode, render, to_chat
 from proprio_mllm.model.processor import CHAT_TEMPLATE, ProprioProcessor, load_processor
 from proprio_mllm.model.tokenizer import SPECIAL_TOKENS, train_tokenizer
-from proprio_mllm.model.vocabulary import add_motion_tokens, motion_text, motion_tokens, parse_motion
+from proprio_mllm.model.vocabulary import (
+    MOTION_END,
+    MOTION_MASK,
+    MOTION_START,
+    add_motion_tokens,
+    motion_text,
+    motion_tokens,
+)
 
 
 def _pieces(processor, text):
@@ -60,9 +67,7 @@ def test_motion_vocabulary():
     ids = add_motion_tokens(tokenizer, 8)
     assert tokenizer.convert_ids_to_tokens(list(ids)) == list(motion_tokens(8))
     assert add_motion_tokens(tokenizer, 8) == ids
-    assert parse_motion(motion_text([3, 0, 7]), 8) == (3, 0, 7)
-    with pytest.raises(ValueError, match=r"code 8 outside the codebook \[0, 8\)"):
-        parse_motion("<motion_8>", 8)
+    assert motion_text([3, 0, None])[len(MOTION_START) : -len(MOTION_END)] == f"<motion_3><motion_0>{MOTION_MASK}"
     with pytest.raises(ValueError, match="beyond 4 codes"):
         add_motion_tokens(tokenizer, 4)
     with pytest.raises(ValueError, match="codes must be positive"):
