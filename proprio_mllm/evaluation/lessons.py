@@ -51,6 +51,8 @@ from sim.tasks.instructions import ORDINALS, TEMPLATES, natural_name, plural
 from sim.tasks.sample import TRAIN_ROOMS, rng_for
 
 _MAX_STEPS: Final = 40
+#: How often an instruction says where a thing is that is in view; the simulator's do, where a robot sees more than was thought.
+_TOLD_IN_VIEW: Final = 0.3
 _RENAMED: Final = 0.5
 _MOST_RENAMED: Final = 5
 _SYLLABLES: Final = ("ba", "do", "fi", "gu", "ka", "lo", "mi", "nu", "pe", "ra", "so", "tu", "va", "wo", "xi", "zu")
@@ -78,7 +80,8 @@ class WordsOnly:
         self.task, self.scene = draw_task(rooms, self.rng)
         self.robot = str(self.rng.choice(robots))
         self.world = TextWorld(self.task, self.scene, load_robot(self.robot), self.rng)
-        hidden = [name for name in self.task.objects if name not in self.world.seen]
+        told = rng_for("where it is", seed)
+        hidden = [name for name in self.task.objects if name not in self.world.seen or told.random() < _TOLD_IN_VIEW]
         self._instruction = self.task.sentences(self.scene.furniture, self.rng, hidden)[0]
         order = self.rng.permutation(len(self.scene.furniture))
         self._furniture = tuple(self.scene.furniture[int(index)] for index in order)

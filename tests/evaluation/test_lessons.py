@@ -18,6 +18,8 @@ from proprio_mllm.evaluation.dagger import collect_lessons
 from proprio_mllm.evaluation.lessons import Lessons, WordsOnly
 from proprio_mllm.model.word_tokens import WordTokens, add_word_tokens
 from proprio_mllm.model.wording import answer_words, id_words, text_words
+from proprio_mllm.planners.scripted.instruction import read_goals
+from proprio_mllm.planners.scripted.words import type_of
 from proprio_mllm.training.sources import held_out
 from sim.collection.text_world import TextWorld
 from sim.scene.compiler import PHYSICS
@@ -156,3 +158,14 @@ def test_slots_are_the_same_in_instruction_and_ids() -> None:
     assert words.tokens(["boxes"]) == words.tokens(["box", "s"])
     assert len({put, two, zubo, ending}) == 4
     assert words.tokens(["mika"]) != words.tokens(["zubo"])
+
+
+def test_some_instructions_say_where_a_thing_is_that_is_in_view() -> None:
+    """So does the simulator's, where a robot sees more than its task was written for."""
+    told, hidden = 0, 0
+    for seed in range(150):
+        shown = WordsOnly(seed).shown()
+        for mention in {goal.obj for goal in read_goals(shown.instruction, shown.known_objects) if goal.obj.place is not None}:
+            in_view = any(type_of(name) == mention.name for name in shown.visible_objects)
+            told, hidden = told + in_view, hidden + (not in_view)
+    assert 0.05 < told / (told + hidden) < 0.3
