@@ -1,6 +1,6 @@
-"""Keeps what docs/benchmark.md says of runs, as files beside it: `python -m tools.publish RUN [RUN …]`.
+"""Keeps what docs/benchmark.md says of runs, as files beside it: `python -m tools.publish RUN [RUN …] [into=FOLDER]`.
 
-`docs/results/NAME.json` holds a run's command, physics, weights and rows, and task by task whether it was solved and in time.
+`docs/results/NAME.json` (or `FOLDER/NAME.json` below it, for runs of another physics) holds a run's command, physics, weights and rows, and task by task whether it was solved and in time.
 Tests hold the figures of README.md and docs/benchmark.md against these files, and `make reproduce` holds a rerun against them.
 """
 
@@ -44,15 +44,16 @@ def published(run: Run) -> dict[str, Any]:
     }
 
 
-def results() -> dict[str, dict[str, Any]]:
-    """All that is published, by name."""
-    return {path.stem: read_json(path) for path in sorted(FOLDER.glob("*.json"))}
+def results(into: str = ".") -> dict[str, dict[str, Any]]:
+    """All that is published in a folder, by name."""
+    return {path.stem: read_json(path) for path in sorted((FOLDER / into).glob("*.json"))}
 
 
-def main(folders: Sequence[str]) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Publishes runs under their folders' names without the hash."""
-    for folder in map(Path, folders):
-        target = FOLDER / f"{folder.resolve().name.rpartition('-')[0]}.json"
+    into = next((word.removeprefix("into=") for word in arguments if word.startswith("into=")), ".")
+    for folder in (Path(word) for word in arguments if not word.startswith("into=")):
+        target = FOLDER / into / f"{folder.resolve().name.rpartition('-')[0]}.json"
         write_text(target, json.dumps(published(load_run(folder)), indent=1) + "\n")
         sys.stdout.write(f"{target}\n")
     return 0
