@@ -1,8 +1,8 @@
 """Keeps what docs/benchmark.md says of runs, as files beside it: `python -m tools.publish RUN [RUN …] [into=FOLDER]`.
 
-`docs/results/NAME.json` (or `FOLDER/NAME.json` below it, for runs of another physics) holds a run's command, physics, weights and
-rows, and task by task whether it was solved and in time. Tests hold the figures of README.md and docs/benchmark.md against these
-files, and `make reproduce` holds a rerun against them.
+`docs/results/NAME.json` (or `FOLDER/NAME.json` below it, for runs of another physics) holds a run's command, physics, weights
+and rows, and task by task whether it was solved and in time. Tests hold the figures of README.md and docs/benchmark.md against
+these files, and `make reproduce` holds a rerun against them.
 """
 
 from __future__ import annotations
