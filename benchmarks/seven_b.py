@@ -99,7 +99,7 @@ def random_weights(model: ModelConfig, folder: Path) -> Path:
         for name in ("image_token_id", "video_token_id", "vision_start_token_id", "vision_end_token_id"):
             setattr(config, name, getattr(ours, name))
         torch.set_default_dtype(getattr(torch, model.dtype))
-        with new_folder(folder) as work, torch.device("cuda" if torch.cuda.is_available() else "cpu"):
+        with new_folder(folder) as work, torch.device(processes().device or "cpu"):
             Qwen2_5_VLForConditionalGeneration(config).save_pretrained(str(work))
             processor.save_pretrained(str(work))
         torch.set_default_dtype(torch.float32)

@@ -10,9 +10,11 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from configs.arguments import command, read_named
 from data.files import read_json, write_text
 from interface.episode import Outcome
 from proprio_mllm.report.references import references_of
@@ -50,11 +52,23 @@ def results(into: str = ".") -> dict[str, dict[str, Any]]:
     return {path.stem: read_json(path) for path in sorted((FOLDER / into).glob("*.json"))}
 
 
+@dataclass(frozen=True)
+class Options:
+    """Command line.
+
+    Attributes:
+        into: folder below `docs/results`.
+    """
+
+    into: str = "."
+
+
+@command(ValueError, OSError)
 def main(arguments: Sequence[str]) -> int:
     """Publishes runs under their folders' names without the hash."""
-    into = next((word.removeprefix("into=") for word in arguments if word.startswith("into=")), ".")
-    for folder in (Path(word) for word in arguments if not word.startswith("into=")):
-        target = FOLDER / into / f"{folder.resolve().name.rpartition('-')[0]}.json"
+    folders, options = read_named(Options, arguments, ("RUN",), more=True)
+    for folder in map(Path, folders):
+        target = FOLDER / options.into / f"{folder.resolve().name.rpartition('-')[0]}.json"
         write_text(target, json.dumps(published(load_run(folder)), indent=1) + "\n")
         sys.stdout.write(f"{target}\n")
     return 0

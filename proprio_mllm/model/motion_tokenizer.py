@@ -150,8 +150,8 @@ class MotionTokenizer(nn.Module):
 
     @torch.no_grad()
     def encode(self, motion: Tensor) -> Tensor:
-        """Tokens (B, T / stride * codebooks) of motion (B, T, F) in raw units, those of one step together."""
-        return self.quantizer.tokens(self._encode(motion)).flatten(1)
+        """Tokens (B, T / stride * codebooks) of motion (B, T, F) in raw units on any device, those of one step together."""
+        return self.quantizer.tokens(self._encode(motion.to(self.mean.device))).flatten(1)
 
     @torch.no_grad()
     def decode(self, ids: Tensor) -> Tensor:
@@ -177,7 +177,7 @@ class MotionTokenizer(nn.Module):
         missing = self.cfg.window - len(frames)
         if missing:
             frames = np.concatenate([np.repeat(frames[:1], missing, axis=0), frames])
-        return tuple(self.encode(torch.from_numpy(frames)[None].to(self.mean.device))[0].tolist())
+        return tuple(self.encode(torch.from_numpy(frames)[None])[0].tolist())
 
     def save(self, folder: str | Path) -> None:
         """Writes `config.json` and `model.safetensors`, each atomically."""

@@ -134,7 +134,7 @@ def evaluate_tokenizer(
 def _joint_error(tokenizer: MotionTokenizer, windows: NDArray[np.float32], solver: JointAngles) -> float:
     """Mean error (deg) of the joints that key bodies show, over some of the windows."""
     chosen = windows[np.linspace(0, len(windows) - 1, min(_ROBOT_WINDOWS, len(windows))).round().astype(int)]
-    rebuilt = tokenizer.decode(tokenizer.encode(torch.from_numpy(chosen).to(tokenizer.mean.device))).cpu().numpy()
+    rebuilt = tokenizer.decode(tokenizer.encode(torch.from_numpy(chosen))).cpu().numpy()
     errors = [
         np.abs(solver(copy)[1] - solver(window)[1])[:, solver.shown] for window, copy in zip(chosen, rebuilt, strict=True)
     ]

@@ -88,7 +88,7 @@ class AlignmentData:
             raise ValueError("no training clip has pictures; alignment needs stage=data with data.replay.enabled=true")
 
     def _encode(self, windows: NDArray[np.float32]) -> list[list[int]]:
-        return self.tokenizer.encode(torch.from_numpy(windows).to(self.tokenizer.mean.device)).tolist()
+        return self.tokenizer.encode(torch.from_numpy(windows)).tolist()
 
     def batch(self, kind: Kind, rng: np.random.Generator, size: int) -> Parts:
         """A batch of one kind from the training rows, in parts."""

@@ -120,8 +120,8 @@ def reconstruction_metrics(tokenizer: MotionTokenizer, rows: NDArray[np.float32]
         mean difference of the key bodies' velocities; `height_mm` of the pelvis; `hand_state`, share of hands whose state at
         the end, open or not, survives; `count` of windows.
     """
-    truth = torch.from_numpy(rows).to(tokenizer.mean.device)
-    rebuilt = torch.cat([tokenizer.decode(tokenizer.encode(part)) for part in truth.split(256)])
+    truth = torch.from_numpy(rows)
+    rebuilt = torch.cat([tokenizer.decode(tokenizer.encode(part)).cpu() for part in truth.split(256)])
     keys = 3 * KEY_BODY_COUNT
     away = (rebuilt[..., :keys] - truth[..., :keys]).unflatten(-1, (KEY_BODY_COUNT, 3))  # (N, T, K, 3)
     error, speed = away.norm(dim=-1), away.diff(dim=1).norm(dim=-1) * FPS
@@ -140,7 +140,7 @@ def reconstruction_metrics(tokenizer: MotionTokenizer, rows: NDArray[np.float32]
 @torch.no_grad()
 def codebook_use(tokenizer: MotionTokenizer, rows: NDArray[np.float32]) -> NDArray[np.int64]:
     """How often each token occurs (vocabulary,) in windows (N, T, F)."""
-    parts = torch.from_numpy(rows).to(tokenizer.mean.device).split(256)
+    parts = torch.from_numpy(rows).split(256)
     counts = sum(torch.bincount(tokenizer.encode(part).flatten(), minlength=tokenizer.cfg.vocabulary) for part in parts)
     assert isinstance(counts, torch.Tensor)
     return counts.cpu().numpy()

@@ -39,8 +39,7 @@ _GREY, _ORANGE, _BLUE = "#999999", "#ee8866", "#4477aa"
 @torch.no_grad()
 def reconstruct(tokenizer: MotionTokenizer, window: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Key bodies (T, K, 3) of a window (T, F) and of its reconstruction, metres, pelvis heading frame."""
-    told = torch.from_numpy(window[None]).to(tokenizer.mean.device)
-    rebuilt = tokenizer.decode(tokenizer.encode(told))[0].cpu().numpy()
+    rebuilt = tokenizer.decode(tokenizer.encode(torch.from_numpy(window[None])))[0].cpu().numpy()
     return decode_key_bodies(window), decode_key_bodies(rebuilt)
 
 

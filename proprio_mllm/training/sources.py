@@ -194,9 +194,8 @@ class Demos:
     def tokens(self, tokenizer: MotionTokenizer) -> NDArray[np.int64]:
         """Motion tokens (N, T / stride) of every row's window."""
         with torch.no_grad():
-            device = tokenizer.mean.device
             newest = self.motions[:, -tokenizer.cfg.window :]
-            parts = [torch.from_numpy(newest[i : i + 256]).to(device) for i in range(0, len(newest), 256)]
+            parts = [torch.from_numpy(newest[i : i + 256]) for i in range(0, len(newest), 256)]
             return torch.cat([tokenizer.encode(part) for part in parts]).cpu().numpy()
 
     def view(self, row: Mapping[str, Any]) -> View:

@@ -234,6 +234,13 @@ def test_online_equals_offline(kind):
     assert torch.equal(tokenizer.decode(offline), tokenizer.eval().decode(offline))
 
 
+def test_motion_may_be_on_another_device(monkeypatch):
+    """A GPU's model is given what was read from files; the meta device stands for it."""
+    tokenizer = MotionTokenizer(CFG).to("meta")
+    monkeypatch.setattr(tokenizer.quantizer, "tokens", lambda vectors: vectors)
+    assert tokenizer.encode(_motion(2)).is_meta
+
+
 def test_round_trip_continues_training_alike(tmp_path):
     torch.manual_seed(0)
     tokenizer = MotionTokenizer(CFG).train()

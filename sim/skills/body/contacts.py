@@ -27,7 +27,7 @@ class Contacts:
         self._hand_joints = np.array([int(model.joint(n).id) for arm in Arm for n in spec.arms[arm.value].hand_joints])
         sliding = model.jnt_type[self._hand_joints] == int(mujoco.mjtJoint.mjJNT_SLIDE)
         self._hand_scale = np.where(sliding, 0.2, 1.0)
-        self._mine = np.where(np.isin(model.geom_bodyid, list(world.scene.robot_bodies)), 1, -1)
+        self._mine = np.isin(model.geom_bodyid, list(world.scene.robot_bodies))
 
     def pushed(self) -> Array:
         """(3,) how strongly obstacles push the robot.
@@ -60,7 +60,7 @@ class Contacts:
         """Whether a part of the robot is within a millimetre of an object; asleep, it has no contacts that would tell."""
         model, data = self._world.model, self._world.data
         own = [geom for geom in obj.geom_ids if model.geom_contype[geom] > 0]
-        for mine in np.flatnonzero((self._mine > 0) & (model.geom_contype > 0)):
+        for mine in np.flatnonzero(self._mine & (model.geom_contype > 0)):
             for geom in own:
                 near = model.geom_rbound[mine] + model.geom_rbound[geom] + _TOUCH_M
                 if np.linalg.norm(data.geom_xpos[mine] - data.geom_xpos[geom]) > near:
@@ -75,13 +75,13 @@ class Contacts:
         if data.ncon == 0:
             return 0.0, False
         owner = self._contact_owner()[data.contact.geom[: data.ncon]]  # (C, 2): 2 robot, 1 in one hand, 0 in both, -1 else
-        touched = np.min(owner, axis=1) < 0
-        pressed, caught = touched & (np.max(owner, axis=1) == 2), touched & (np.max(owner, axis=1) >= 1)
+        touched, most = np.min(owner, axis=1) < 0, np.max(owner, axis=1)
+        pressed, caught = touched & (most == 2), touched & (most >= 1)
         return float(-np.min(data.contact.dist[: data.ncon][pressed], initial=0.0)), bool(caught.any())
 
     def _contact_owner(self) -> NDArray[np.int64]:
         """(ngeom,) 2 for the robot's geoms, 1 for those of what one hand holds, 0 for what both hold, -1 for all others."""
-        owner = np.where(self._mine > 0, 2, -1)
+        owner = np.where(self._mine, 2, -1)
         for obj in self._world.objects.values():
             if obj.held_by:
                 owner[obj.geom_ids] = 2 - len(obj.held_by)

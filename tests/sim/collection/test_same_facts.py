@@ -119,4 +119,4 @@ def test_physics_and_table_change_the_same_facts_in_families_of_training_too(fam
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", PAPER_ROBOTS)
 def test_physics_and_table_change_the_same_facts_in_many_tasks(robot: str) -> None:
-    assert sum(compared(robot, task) for task in TASKS[5::30]) > 60
+    assert sum(compared(robot, task) for task in TASKS[5::18]) > 100

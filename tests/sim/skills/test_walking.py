@@ -163,7 +163,8 @@ def test_the_standing_foot_stays_where_it_is(robot: str, down_m: float) -> None:
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_a_hand_that_runs_into_a_wall_ends_the_walk(robot: str) -> None:
+@pytest.mark.parametrize("low", [False, True])
+def test_a_hand_that_runs_into_a_wall_ends_the_walk(robot: str, low: bool) -> None:
     session = Session(robot, image_size=0, all_known=True)
     session.reset(FreePlay("living_room_1", placements=()), 0)
     body, world = session.body, session.world
@@ -174,7 +175,10 @@ def test_a_hand_that_runs_into_a_wall_ends_the_walk(robot: str) -> None:
     session.teleport(float(spot[0]), float(spot[1]), -np.pi / 2.0)
     for arm in Arm:
         body.arms.command(arm, body.ik.vias(arm)[1])  # hands forward
+    if low:
+        body.base.command_height(session.robot.pelvis_height_range_m[0])
     world.advance(1.5)
+    height_m = body.posture.pelvis_height_m
     free_m = navigation.free_travel(spot, spot + ahead)
     assert free_m > 0.9, "the disc would fit"
     _, feedback = session.step(PlanStep.parse("MoveAhead(1.0)"))
@@ -182,6 +186,7 @@ def test_a_hand_that_runs_into_a_wall_ends_the_walk(robot: str) -> None:
     assert outcome.code == "BlockedPath"
     assert outcome.margins["travel_m"] < free_m - 0.03
     assert np.all(body.contacts.pushed() < (0.03, 0.05, 0.35))
+    assert body.posture.pelvis_height_m == pytest.approx(height_m, abs=1e-6), "and has come down from what it rose to walk"
     _, back = session.step(PlanStep.parse("MoveBack(0.3)"))
     assert back.success, "and the robot can walk away"
 

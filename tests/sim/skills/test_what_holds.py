@@ -15,7 +15,13 @@ from sim.skills.manipulate import OFF_BODY_M
 from sim.skills.runner import CONTROL_DT_S
 from sim.world.world import World
 
-MUG = FreePlay("kitchen_1", placements=(ObjectPlacement("Mug_1", "DiningTable_1", (1.5, -0.85)),))
+MUG = FreePlay(
+    "kitchen_1",
+    placements=(
+        ObjectPlacement("Mug_1", "DiningTable_1", (1.5, -0.85)),
+        ObjectPlacement("Apple_1", "CounterTop_1", (-0.4, 2.2)),
+    ),
+)
 
 
 @pytest.fixture(params=["h1", "x1"])
@@ -86,6 +92,27 @@ def test_fingers_rest_on_what_they_hold(carrying: Session) -> None:
     servos, spec = carrying.world.servos, carrying.world.scene.the_robot().arms["right"]
     told, measured = servos.joint_targets(), servos.joint_positions()
     assert max(abs(told[name] - measured[name]) for name in spec.hand_joints) < 0.02
+
+
+def test_what_one_hand_holds_pushes_like_the_hand(carrying: Session) -> None:
+    """An apple is put below the mug, where it meets the mug alone; what both hands hold may brush along things."""
+    world, contacts = carrying.world, carrying.body.contacts
+    assert contacts.pushed()[2] == 0.0
+    mug, apple = world.object("Mug_1"), world.object("Apple_1")
+    (low, high), (bottom, top) = (np.array(world.poses.bounds(name)) for name in ("Mug_1", "Apple_1"))
+    below = 0.5 * (low + high) - 0.5 * (bottom + top)
+    below[2] = low[2] - top[2]
+    place = world.data.qpos[apple.qpos_adr : apple.qpos_adr + 3]
+    place += below
+    world.advance(CONTROL_DT_S)  # which wakes it
+    while world.data.ncon == 0 and world.poses.bounds("Apple_1")[1][2] < high[2]:
+        place[2] += 0.003
+        mujoco.mj_forward(world.model, world.data)
+    depth_m, _, off_rad = contacts.pushed()
+    assert depth_m == 0.0 and off_rad > 0.0
+    mug.held_by.append("left")
+    assert contacts.pushed()[2] == 0.0
+    mug.held_by.remove("left")
 
 
 def test_what_is_held_meets_the_body_of_the_robot(carrying: Session) -> None:
