@@ -34,13 +34,16 @@ _AWKWARD: Final = 0.08
 #: How often what one has walked to is still out of reach: arms that are solved apart from the waist do not lean. Some things
 #: lie so that it is nearly always: how many of them, and how often then. These and the next figures were measured with the
 #: teacher's steps.
-_FAR: Final = {"whole_body": 0.08, "per_arm": 0.3}
-_AWKWARD_PLACE: Final = {"whole_body": 0.1, "per_arm": 0.15}
+_FAR: Final = {"whole_body": 0.04, "per_arm": 0.22}
+_AWKWARD_PLACE: Final = {"whole_body": 0.06, "per_arm": 0.1}
 _FAR_THERE: Final = 0.75
+#: How often the other things there are in reach too, and how often nothing is after a turn or a step.
+_BESIDE: Final = {"whole_body": 0.85, "per_arm": 0.5}
+_AWAY: Final = {"whole_body": 0.25, "per_arm": 0.9}
 #: How often a walk, a turn or a step aside is blocked, and how often a walk to a chosen distance has no free end.
-_BLOCKED: Final = {"GoTo": 0.05, "RotateLeft": 0.05, "RotateRight": 0.05}
+_BLOCKED: Final = {"GoTo": 0.025, "RotateLeft": 0.05, "RotateRight": 0.05}
 _BLOCKED_STEP: Final = 0.2
-_NO_POSE: Final = 0.35
+_NO_POSE: Final = 0.04
 #: How often each thing in front is seen on arrival, and with each further look that shows more of it.
 _AT_ONCE: Final = 0.75
 _LOOK: Final = {"MoveUp": 0.6, "MoveDown": 0.1}
@@ -156,7 +159,11 @@ class TextWorld:
         self.visible = [*(name for name in ids if name in shown), *(name for name in self.facts.objs if name in seen)]
         self._near = set()
         if near:
-            self._near = {name for name in objs if self._rng.random() < (1.0 - self._far[name] if name == wanted else 0.6)}
+            self._near = {
+                name
+                for name in objs
+                if self._rng.random() < (1.0 - self._far[name] if name == wanted else _BESIDE[self._solver])
+            }
             if wanted != place or self._rng.random() >= self._far[place]:
                 self._near.add(place)
 
@@ -236,7 +243,7 @@ class TextWorld:
         """After a turn or a step the stance is another one."""
         self._awkward.clear()
         self._look(_LOOK_ASIDE)
-        if self._rng.random() < 0.7:
+        if self._rng.random() < _AWAY[self._solver]:
             self._near = set()
 
     def _look(self, share: float) -> None:
