@@ -5,9 +5,9 @@ import importlib.util
 import numpy as np
 import pytest
 
-from robots.build import ASSETS, find_menagerie
-from robots.build_x1 import build_x1
-from robots.csv_tree import read_rows
+from tools.robot_models.__main__ import ASSETS, find_menagerie
+from tools.robot_models.csv_tree import read_rows
+from tools.robot_models.x1 import build_x1
 
 
 def test_x1_is_rebuilt_as_committed(tmp_path):
@@ -42,7 +42,7 @@ def test_missing_menagerie_names_the_package(monkeypatch):
 def test_reduced_mesh_keeps_its_shape():
     trimesh = pytest.importorskip("trimesh")
     pytest.importorskip("fast_simplification")
-    from robots.build_h1 import reduce_mesh
+    from tools.robot_models.h1 import reduce_mesh
 
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
     reduced = reduce_mesh(np.asarray(ball.vertices), np.asarray(ball.faces), 400)

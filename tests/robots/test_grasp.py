@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from interface.bodies import SIDES
-from robots.build_common import ROBOT_AFFINITY, ROBOT_BIT
 from robots.spec import available_robots, load_robot
+from tools.robot_models.common import ROBOT_AFFINITY, ROBOT_BIT
 
 
 def _fixed_robot(name: str) -> mujoco.MjSpec:

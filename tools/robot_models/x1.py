@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from robots.build_common import (
+from tools.robot_models.common import (
     HAND_FRICTION,
     ROBOT_AFFINITY,
     ROBOT_BIT,
@@ -24,7 +24,7 @@ from robots.build_common import (
     tune_joint,
     zero_pose,
 )
-from robots.csv_tree import add_link, read_rows, set_inertia
+from tools.robot_models.csv_tree import add_link, read_rows, set_inertia
 
 WHITE = (0.86, 0.87, 0.9, 1.0)
 GREY = (0.35, 0.37, 0.42, 1.0)

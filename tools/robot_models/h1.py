@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from robots.build_common import (
+from tools.robot_models.common import (
     HAND_FRICTION,
     ROBOT_AFFINITY,
     ROBOT_BIT,
@@ -25,7 +25,7 @@ from robots.build_common import (
     stiffen_limits,
     tune_joint,
 )
-from robots.csv_tree import LinkRow, add_link, read_rows
+from tools.robot_models.csv_tree import LinkRow, add_link, read_rows
 
 SKIN = [0.16, 0.16, 0.18, 1.0]
 #: Triangles kept per mesh; the Menagerie meshes have 286 k together, which costs 10 x in rendering on a CPU.
