@@ -75,8 +75,6 @@ def collect_lessons(
         overwrite: start over when the folder holds something else.
     """
     keyed = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "workers")}
-    if not keyed["foreseen"]:
-        del keyed["foreseen"]
     keyed["version"] = 1
     report = progress or (lambda done, parts: None)
     return _write(config, config_hash(keyed), functools.partial(_lessons, config), {"config": keyed}, report, overwrite)
@@ -98,7 +96,7 @@ def _write(
     for done, (part, rows) in enumerate(_computed(job, missing, config.workers), total - len(missing) + 1):
         writer.write(part, rows)
         progress(done, total)
-    return writer.finish({**about, "physics": PHYSICS} | ({"foreseen": True} if config.foreseen else {}))
+    return writer.finish({**about, "physics": PHYSICS})
 
 
 def _lessons(config: CollectConfig, part: int, student: str | None = None) -> list[dict[str, Any]]:

@@ -166,15 +166,11 @@ class Lessons:
         return episode
 
     def told(self, folder: Path) -> tuple[WordEpisode, ...]:
-        """All episodes of a folder as `logged` gives them, in order and with their own names; a turn is a row.
-
-        Where what is out of reach was foreseen, the steps of the answers are the rows' targets.
-        """
+        """All episodes of a folder in order and with their own names; a turn is a row, whose target is its answer's step."""
         reader, targets = ShardReader(folder, "demos"), dict[str, list[PlanStep]]()
-        if reader.manifest.metadata.get("foreseen"):
-            for episode, target in zip(reader.column("episode"), reader.column("target"), strict=True):
-                targets.setdefault(episode, []).append(PlanStep.parse(target))
-        return tuple(_of_log(looks, done, {}, targets.get(name)) for name, (looks, done) in _logs(folder).items())
+        for episode, target in zip(reader.column("episode"), reader.column("target"), strict=True):
+            targets.setdefault(episode, []).append(PlanStep.parse(target))
+        return tuple(_of_log(looks, done, {}, targets[name]) for name, (looks, done) in _logs(folder).items())
 
 
 def _of_log(

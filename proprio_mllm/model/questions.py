@@ -2,7 +2,7 @@
 
 Each builder gives a question and the true answer from the object's centre in the pelvis heading frame, which training data
 carries. Answers are words or one action, never raw coordinates. "Proprioceptive" questions depend on the body's shape and
-posture: which arm reaches, and how far the body must go down or up.
+posture: which arm is nearer, and how far the body must go down or up.
 
 Frame: pelvis heading frame, x forward, y left, z up, metres. The bins are ours, the paper names none.
 """
@@ -28,8 +28,8 @@ NEAR_M, FAR_M = 1.0, 2.0
 LOW_M, HIGH_M = -0.15, 0.25
 #: Lateral offset within which either arm does, metres.
 EITHER_M = 0.1
-#: Share of the arm's length that is used, and the distance the robot keeps from an object as a share of that length.
-USABLE, STANDOFF = 0.95, 0.6
+#: How far below the shoulders the hands work most freely, as a share of the arm's length: forearms level.
+WORKING = 0.5
 #: Body shifts are rounded to this, metres.
 STEP_M = 0.1
 
@@ -40,7 +40,7 @@ QUESTIONS: Mapping[str, Mapping[Style, str]] = {
     "height": {"terse": "height {}", "full": "Is {} low, level or high relative to your pelvis?"},
     "arm": {"terse": "Pick {}", "full": "Which arm reaches {} better: left, right or either?"},
     "see": {"terse": "see?", "full": "Which objects do you see, from left to right? Give their ids."},
-    "shift": {"terse": "MoveDown {}", "full": "How must your body height change to reach {}? Give MoveDown, MoveUp or none."},
+    "shift": {"terse": "MoveDown {}", "full": "How must your height change to work on {}? Give MoveDown, MoveUp or none."},
 }
 
 
@@ -78,28 +78,21 @@ def arm_answer(center: NDArray[np.floating]) -> str:
 
 
 def body_shift_m(center: NDArray[np.floating], key_bodies: NDArray[np.floating]) -> float:
-    """Change of pelvis height that brings the object into the arms' reach, metres, negative is down, multiples of `STEP_M`.
+    """Change of pelvis height that brings the object level with the hands at work, metres, negative is down.
 
-    The robot may step up to the object until it is `STANDOFF` arm lengths away in the plane; the vertical reach left there is
-    that of a sphere of radius `USABLE` arm lengths around the shoulders.
+    The hands work `WORKING` arm lengths below the shoulders; changes are multiples of `STEP_M`.
 
     Args:
         center: (3,) object.
         key_bodies: (K, 3) the robot's own bodies.
     """
-    length = arm_length_m(key_bodies)
     shoulders = [KEY_BODIES.index("left_shoulder"), KEY_BODIES.index("right_shoulder")]
-    shoulder_z = float(np.asarray(key_bodies)[shoulders, 2].mean())
-    reach = math.sqrt((USABLE * length) ** 2 - (STANDOFF * length) ** 2)
-    offset = float(center[2]) - shoulder_z
-    if abs(offset) <= reach:
-        return 0.0
-    shift = offset + reach if offset < 0 else offset - reach
-    return math.copysign(math.ceil(abs(shift) / STEP_M - 1e-9) * STEP_M, shift)
+    level_m = float(np.asarray(key_bodies)[shoulders, 2].mean()) - WORKING * arm_length_m(key_bodies)
+    return round((float(center[2]) - level_m) / STEP_M) * STEP_M
 
 
 def shift_answer(center: NDArray[np.floating], key_bodies: NDArray[np.floating]) -> str:
-    """The body action that brings the object into reach, or `none`; at most 1 m."""
+    """The body action that brings the object level with the hands at work, or `none`; at most 1 m."""
     shift = body_shift_m(center, key_bodies)
     if shift == 0.0:
         return "none"

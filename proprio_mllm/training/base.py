@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from configs.schema.train import BaseConfig
 from proprio_mllm.model.batch import Batch, Collator, Example, ImageBatch, Movable
-from proprio_mllm.model.dense import DenseHead, DenseTargets, dense_targets
+from proprio_mllm.model.dense import DenseHead, shown_shares
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
 from proprio_mllm.training.asking import answer_shares
@@ -57,9 +57,9 @@ class _WithDense(nn.Module):
             visual = self.model.visual_tokens(batch.images)
         if batch.dense is not None:
             assert visual is not None
-            dense = self.head(visual, self.model.table, batch.dense)
-            values |= {"dense_recall": dense.recall, "dense_point_m": dense.point_error_m}
-            total = dense.total if total is None else total + batch.dense_weight * dense.total
+            dense, recall = self.head(visual, self.model.table, batch.dense)
+            values |= {"dense_loss": float(dense.detach()), "dense_recall": recall}
+            total = dense if total is None else total + batch.dense_weight * dense
         assert total is not None
         return total, values
 
@@ -72,7 +72,7 @@ class _JointBatch(Movable):
     kind: Literal["dense", "look", "plan", "judge"]
     text: Batch | None
     images: ImageBatch | None
-    dense: DenseTargets | None
+    dense: Tensor | None
     dense_weight: float
 
 
@@ -93,26 +93,21 @@ class _Base(Objective):
 
     def _view_batch(self, rng: np.random.Generator, size: int, questions: int) -> _JointBatch:
         rows = [self._views.row(i) for i in rng.choice(self._views.split.train, size)]
-        targets = _targets(rows, len(self._views.type_names))
+        segmentation = torch.from_numpy(np.stack([row.segmentation for row in rows]))
+        grid = segmentation.shape[1] // 28, segmentation.shape[2] // 28
+        shares = shown_shares(segmentation, grid, len(self._views.type_names))
         if not questions:
-            return _JointBatch("dense", None, self._collator.images([row.view for row in rows]), targets, 1.0)
+            return _JointBatch("dense", None, self._collator.images([row.view for row in rows]), shares, 1.0)
         examples = []
         for row in rows:
             # the list comes last: its order, from left to right, would give away where things are
             pairs = [*self._views.pairs(row, (*GROUNDING, *BODY_RELATIVE), questions, rng), self._views.listing(row)]
             examples.append(Example(looking(pairs, style=self._views.style), (row.view,)))
-        return _JointBatch("look", self._collator(examples), None, targets, self._cfg.dense_weight)
-
-
-def _targets(rows: Sequence[Any], types: int) -> DenseTargets:
-    segmentation = torch.from_numpy(np.stack([row.segmentation for row in rows]))
-    points = torch.from_numpy(np.stack([row.points_m for row in rows]))
-    side = segmentation.shape[1] // 28
-    return dense_targets(segmentation, points, (side, segmentation.shape[2] // 28), types)
+        return _JointBatch("look", self._collator(examples), None, shares, self._cfg.dense_weight)
 
 
 class DenseObjective(_Base):
-    """Dense, name-tied pretraining: which types each visual token shows, and its mean point."""
+    """Dense, name-tied pretraining: which types each visual token shows."""
 
     name = "base/dense"
 

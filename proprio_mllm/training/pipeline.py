@@ -108,12 +108,6 @@ def base_model_config(model: ModelConfig) -> ModelConfig:
     return variant_model(model, "no_proprio")
 
 
-def loop_values(cfg: LoopConfig) -> dict[str, Any]:
-    """A loop's values for a key: defaults go without saying, so that output from before there was a choice stays current."""
-    silent = {"optimizer": "adamw", "adam_share": 1.0}
-    return {name: value for name, value in dataclasses.asdict(cfg).items() if silent.get(name) != value}
-
-
 def seeded(make: Callable[[], Any], seed: int) -> Any:
     """What `make` builds with torch's random stream at a seed; the stream outside is left as it was."""
     import torch
@@ -172,10 +166,8 @@ class Pipeline:
         stage = self.stages[name]
         inputs = {needed: self.key(needed) for needed in stage.needs}
         inputs |= {kind: shard_hash(self.paths.shards(kind)) for kind in stage.shards}
-        settings = dict(stage.settings(self)) | ({"recipe": stage.recipe} if stage.recipe else {})
-        settings |= {"micro_batches": self.cfg.micro_batches} if self.cfg.micro_batches > 1 else {}
-        settings |= {"keep_spatial": True} if self.cfg.keep_spatial else {}
-        return stage_key(settings, self.cfg.seed, inputs)
+        own = {"recipe": stage.recipe, "micro_batches": self.cfg.micro_batches, "keep_spatial": self.cfg.keep_spatial}
+        return stage_key(dict(stage.settings(self)) | own, self.cfg.seed, inputs)
 
     def ancestors(self, name: str) -> tuple[str, ...]:
         """A stage and everything that went into its output, in the order in which they run."""

@@ -88,7 +88,7 @@ def test_what_was_foreseen_is_the_answer_with_a_picture_and_never_in_words_alone
     targets = reader.column("target")
     told = [_step(turn.answer) for episode in Lessons().told(tmp_path) for turn in episode.turns]
     assert told == [_step(answer_words("Pick", "", PlanStep.parse(target))) for target in targets]
-    assert (targets != taught) == ahead == bool(reader.manifest.metadata.get("foreseen"))
+    assert (targets != taught) == ahead
     assert reader.manifest.metadata["physics"] == PHYSICS
     alone = [_step(turn.answer) for turn in Lessons().logged(tmp_path)(-1).turns]
     assert all(step in [_step(answer_words("Pick", "", PlanStep.parse(text))) for text in taught] for step in alone)

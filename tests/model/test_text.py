@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 
 import numpy as np
 import pytest
@@ -198,13 +197,11 @@ def test_body_shift_by_hand():
         bodies[side] = [0, y, 0.5]
         bodies[side + 1] = [0, y, 0.2]
         bodies[side + 2] = [0, y, -0.1]
-    reach = math.sqrt(0.57**2 - 0.36**2)  # 0.442 m up or down at the standoff
-    assert questions.body_shift_m(np.array([1.0, 0, 0.5 - reach + 0.01]), bodies) == 0.0
-    assert questions.body_shift_m(np.array([1.0, 0, 0.5 - reach - 0.25]), bodies) == pytest.approx(-0.3)
-    assert questions.body_shift_m(np.array([1.0, 0, 0.5 + reach + 0.05]), bodies) == pytest.approx(0.1)
-    assert questions.shift_answer(np.array([1.0, 0, 0.5 - reach - 0.25]), bodies) == "MoveDown(0.3)"
-    assert questions.shift_answer(np.array([1.0, 0, 1.0]), bodies) == "MoveUp(0.1)"
-    assert questions.shift_answer(np.array([1.0, 0, 0.4]), bodies) == "none"
+    assert questions.body_shift_m(np.array([1.0, 0, 0.24]), bodies) == 0.0  # hands work at 0.2 m
+    assert questions.body_shift_m(np.array([1.0, 0, -0.12]), bodies) == pytest.approx(-0.3)
+    assert questions.shift_answer(np.array([1.0, 0, -0.12]), bodies) == "MoveDown(0.3)"
+    assert questions.shift_answer(np.array([1.0, 0, 0.28]), bodies) == "MoveUp(0.1)"
+    assert questions.shift_answer(np.array([1.0, 0, 0.16]), bodies) == "none"
     assert questions.shift_answer(np.array([1.0, 0, -9.0]), bodies) == "MoveDown(1)"
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from proprio_mllm.model.building import build_point_map
 from proprio_mllm.training.geometry_stage import PointMapObjective, point_map_error
-from proprio_mllm.training.pipeline import Metrics, Pipeline, loop_values, seeded
+from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded
 from proprio_mllm.training.sources import Views
 
 
@@ -24,7 +24,7 @@ class PointMapStage:
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The loop and the encoder."""
         cfg = pipeline.cfg
-        return {"loop": loop_values(cfg.pointmap), "map": dataclasses.asdict(cfg.model.point_map)}
+        return {"loop": dataclasses.asdict(cfg.pointmap), "map": dataclasses.asdict(cfg.model.point_map)}
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
         """Trains the encoder and measures it on held-out views."""

@@ -72,8 +72,7 @@ def _collect(pipeline: Pipeline, student: Path, shards: Path) -> None:
         raise StageError("stage 'practice' needs the simulator: run it with `python train.py stage=practice`")
     cfg, ahead, collect = pipeline.cfg.practice, pipeline.cfg.collect.foreseen, pipeline.collect_dagger
     acts = pipeline.key("words") if cfg.student is None else read_json(student / "config.json")
-    decides = {"key": acts, "episodes": cfg.episodes, "share": cfg.teacher_share}
-    written = config_hash(decides | ({"foreseen": True} if ahead else {}))
+    written = config_hash({"key": acts, "episodes": cfg.episodes, "share": cfg.teacher_share, "foreseen": ahead})
     size = pipeline.cfg.model.image_size
     request = DaggerRequest(student, shards, cfg.episodes, pipeline.cfg.seed, cfg.teacher_share, size, written, ahead)
 
@@ -89,6 +88,5 @@ def _as_teacher(shards: Path) -> Metrics:
     """How many steps the student took itself, and the share of them that were the teacher's."""
     reader = ShardReader(shards, "demos")
     notes = [json.loads(text) for text in reader.column("privileged")]
-    told = zip(notes, reader.column("target"), strict=True)  # shards from before there was foresight lack `taught`
-    mine = [note["executed"] == note.get("taught", target) for note, target in told if note["origin"] == "student"]
+    mine = [note["executed"] == note["taught"] for note in notes if note["origin"] == "student"]
     return {"own_steps": float(len(mine)), "own_as_teacher": float(np.mean(mine)) if mine else 0.0}

@@ -12,7 +12,7 @@ import numpy as np
 from data.shards import ShardReader, decode_motion
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.motion_stage import FEATURE_BIAS, MotionObjective, MotionWindows, tokenizer_metrics
-from proprio_mllm.training.pipeline import Metrics, Pipeline, loop_values, seeded
+from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded
 from proprio_mllm.training.processes import first_alone
 from proprio_mllm.training.reconstruction import render
 from proprio_mllm.training.sources import Clips
@@ -30,7 +30,7 @@ class TokenizerStage:
         """The loop, the codec and the weights of its features."""
         cfg = pipeline.cfg
         motion = dataclasses.asdict(cfg.model.motion)
-        return {"loop": loop_values(cfg.tokenizer), "motion": motion, "bias": FEATURE_BIAS.tolist()}
+        return {"loop": dataclasses.asdict(cfg.tokenizer), "motion": motion, "bias": FEATURE_BIAS.tolist()}
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
         """Trains and stores the tokenizer, draws reconstructions, and measures it."""
