@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 
 import sim.tasks  # noqa: F401  # chooses the OpenGL backend before anything draws
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import BuiltInPlanner, ModelPlanner
 from configs.schema.robot import RobotConfig
 from interface.feedback import Feedback
 from interface.observation import Observation
@@ -36,7 +37,7 @@ from proprio_mllm.evaluation.worker import EpisodeJob, WorkerSetup
 from proprio_mllm.planners.protocol import Planner, TaskInfo
 from sim.tasks.task import Task, load_benchmark, write_tasks
 
-EXPERT = PlannerConfig("expert", "expert", "Expert", image_size=0)
+EXPERT = BuiltInPlanner("expert", "expert", "Expert", image_size=0)
 EPISODES = (6_650, 35_900)
 CORES = (2, 64, 1_024)
 
@@ -155,7 +156,7 @@ def batches(weights: Path, tasks: Sequence[Task]) -> dict[str, float]:
     from proprio_mllm.planners.registry import make_planner
 
     torch.set_num_threads(1)
-    planner: Any = make_planner(PlannerConfig("model", "mllm", "Model", str(weights)))
+    planner: Any = make_planner(ModelPlanner("model", "mllm", "Model", str(weights)))
     seen = []
     for task in tasks:
         session = open_session(RobotConfig("h1"), "easy", "fixed", task, 0, planner)

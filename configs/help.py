@@ -10,7 +10,7 @@ import re
 import sys
 import textwrap
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import yaml
@@ -80,16 +80,35 @@ def _fields(schema: type, values: Mapping[str, Any], prefix: str) -> Iterator[tu
     for field in dataclasses.fields(schema):
         value = values.get(field.name, _default(field))
         meaning = meanings.get(field.name, "")
-        nested = next((kind for kind in (kinds[field.name], *typing.get_args(kinds[field.name])) if _is_schema(kind)), None)
-        if nested is not None and isinstance(value, Mapping):
-            yield from _fields(nested, value, f"{prefix}{field.name}.")
+        nested = [kind for kind in (kinds[field.name], *typing.get_args(kinds[field.name])) if _is_schema(kind)]
+        if nested and isinstance(value, Mapping):
+            yield from _of_kinds(nested, value, f"{prefix}{field.name}.")
             continue
         allowed = typing.get_args(kinds[field.name]) if typing.get_origin(kinds[field.name]) is typing.Literal else ()
         if allowed:
             meaning = f"{meaning.rstrip('.')} [{', '.join(map(str, allowed))}]"
         yield prefix + field.name, _shown(value), meaning.strip()
-        if nested is not None and value is None:  # a group that is not chosen; its fields as its files leave them
-            yield from _fields(nested, {}, f"{prefix}{field.name}.")
+        if nested and value is None:  # a group that is not chosen; its fields as its files leave them
+            yield from _of_kinds(nested, {}, f"{prefix}{field.name}.")
+
+
+def _of_kinds(schemas: Sequence[type], values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, str, str]]:
+    """Fields of a configuration that may be one of several; those that some kinds alone have say so."""
+    found: dict[str, tuple[str, str]] = {}
+    users: dict[str, list[str]] = {}
+    for schema in schemas:
+        for name, default, meaning in _fields(schema, values, prefix):
+            found.setdefault(name, (default, meaning))
+            users.setdefault(name, []).extend(typing.get_args(typing.get_type_hints(schema).get("kind")))
+    kinds = users.get(f"{prefix}kind", [])
+    for name, (default, meaning) in found.items():
+        if len(schemas) > 1 and name == f"{prefix}kind":
+            meaning = f"{meaning.partition(' [')[0]} [{', '.join(kinds)}]"
+        yield (
+            name,
+            default,
+            meaning if len(users[name]) == len(kinds) else f"{meaning.rstrip('.')} (kind {', '.join(users[name])})",
+        )
 
 
 def _default(field: dataclasses.Field[Any]) -> Any:

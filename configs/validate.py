@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -36,7 +36,7 @@ def build(cls: type[T], values: Mapping[str, Any], where: str = "") -> T:
 
     Args:
         cls: a dataclass; nested dataclasses, enums, Literal, tuples, frozensets, Optional and plain scalars are understood.
-        values: plain mapping with string keys.
+        values: plain mapping with string keys; where a field may be one of several dataclasses, its `kind` says which.
         where: dotted path of this mapping in the whole configuration, for messages.
 
     Raises:
@@ -49,7 +49,8 @@ def build(cls: type[T], values: Mapping[str, Any], where: str = "") -> T:
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     unknown = [key for key in values if key not in fields]
     if unknown:
-        raise ConfigError(f"{_at(where, str(unknown[0]))}: unknown key; {allowed_values(unknown[0], sorted(fields))}")
+        of = f" with kind {values['kind']!r}" if {"kind"} <= values.keys() & fields.keys() else ""
+        raise ConfigError(f"{_at(where, str(unknown[0]))}: unknown key{of}; {allowed_values(unknown[0], sorted(fields))}")
     hints = get_type_hints(cls)
     kwargs: dict[str, Any] = {}
     for name, f in fields.items():
@@ -63,6 +64,14 @@ def build(cls: type[T], values: Mapping[str, Any], where: str = "") -> T:
         raise
     except ValueError as error:
         raise ConfigError(f"{where or cls.__name__}: {error}") from error
+
+
+def _of_kind(schemas: Sequence[Any], kind: object, where: str) -> Any:
+    """The one of several dataclasses whose field `kind` takes a value."""
+    found = {one: schema for schema in schemas for one in get_args(get_type_hints(schema)["kind"])}
+    if kind not in found:
+        raise ConfigError(f"{_at(where, 'kind')}: {kind!r} is not allowed; {allowed_values(kind, found)}")
+    return found[kind]
 
 
 def _at(where: str, name: str) -> str:
@@ -83,6 +92,9 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         options = get_args(hint)
         if value is None and type(None) in options:
             return None
+        schemas = [option for option in options if dataclasses.is_dataclass(option)]
+        if len(schemas) > 1 and isinstance(value, Mapping):
+            return build(_of_kind(schemas, value.get("kind"), where), value, where)
         errors: list[str] = []
         for option in options:
             if option is type(None):

@@ -16,7 +16,8 @@ from typing import Any, Final, Literal
 import eval as evaluation
 from configs.arguments import command, read_arguments
 from configs.compose import compose
-from configs.schema.eval import CHAT_KINDS, EvalConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import CHAT_KINDS, ModelPlanner
 from configs.validate import build
 from proprio_mllm.report.runs import newest
 from proprio_mllm.report.stored import Run, find_runs
@@ -80,8 +81,9 @@ def needed(table: str) -> Iterator[Needed]:
         except ValueError as error:
             reason = "needs a backend" if "backend" in str(error) else str(error)
         else:
-            weights = cfg.weights is not None and not Path(cfg.weights).is_dir()
-            reason = "needs a backend" if cfg.kind in CHAT_KINDS else f"no weights {cfg.weights}" if weights else ""
+            reason = "needs a backend" if cfg.kind in CHAT_KINDS else ""
+            if isinstance(cfg, ModelPlanner) and not Path(cfg.weights).is_dir():
+                reason = f"no weights {cfg.weights}"
         for robot in experiment.robots:
             for difficulty in experiment.difficulties:
                 yield Needed(planner, robot, difficulty, reason)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from configs.schema.eval import PlannerConfig
+from configs.schema.planner import PlannerConfig
 from interface.feedback import Feedback
 from interface.observation import Observation
 from proprio_mllm.backends.batching import Batcher

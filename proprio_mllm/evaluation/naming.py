@@ -12,7 +12,8 @@ from typing import Any, Final
 from configs.compose import group_file
 from configs.schema.backend import BackendConfig
 from configs.schema.checks import defaults_of
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import PLANNER_KINDS
 
 #: Of a planner's fields, those that say who plans rather than how, and `reflection`, which tables have columns for.
 _WHO: Final = frozenset({"weights", "source", "adapter", "train", "memory", "reflection"})
@@ -64,18 +65,20 @@ def as_published(config: Mapping[str, Any]) -> bool:
     planner, backend = config.get("planner", {}), config.get("backend") or {}
     changes = _changed(backend, defaults_of(BackendConfig), _ASKED)
     if group_file("planner", _name(planner)):
-        changes += _changed(planner, _published(planner), [name for name in defaults_of(PlannerConfig) if name not in _WHO])
+        published = _published(planner)
+        changes += _changed(planner, published, [name for name in published if name not in _WHO])
     return not any(otherwise for _, otherwise in changes)
 
 
 def _changed(values: Mapping[str, Any], usual: Mapping[str, Any], names: Sequence[str]) -> list[tuple[str, bool]]:
     """Each setting in words, and whether it is another than usual."""
-    return [(f"{name}{values.get(name)}", values.get(name, usual[name]) != usual[name]) for name in names]
+    return [(f"{name}{values.get(name)}", values.get(name, usual[name]) != usual[name]) for name in names if name in usual]
 
 
 def _published(planner: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a planner's file in `configs/planner`; of one that has none, the defaults."""
-    return defaults_of(PlannerConfig) | group_file("planner", _name(planner))
+    """Settings of a planner's file in `configs/planner`; of one that has none, the defaults of its kind."""
+    schema = PLANNER_KINDS.get(planner.get("kind", ""))
+    return ({} if schema is None else defaults_of(schema)) | group_file("planner", _name(planner))
 
 
 def _name(planner: Mapping[str, Any]) -> str:

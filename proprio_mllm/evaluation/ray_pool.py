@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from configs.schema.eval import PlannerConfig
+from configs.schema.planner import PlannerConfig
 from data.cluster import import_ray
 from interface.observation import Observation
 from proprio_mllm.evaluation.asking import AskingPlanner, ModelDesk, batch_planner

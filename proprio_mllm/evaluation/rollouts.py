@@ -14,7 +14,8 @@ from typing import Any, Final
 
 from tqdm import tqdm
 
-from configs.schema.eval import DifficultyName, PlannerConfig
+from configs.schema.eval import DifficultyName
+from configs.schema.planner import ModelPlanner
 from configs.schema.robot import RobotConfig
 from data.shards import ShardWriter
 from interface.bodies import PAPER_ROBOTS
@@ -72,7 +73,7 @@ def collect_rollouts(
             raise ValueError(f"rollouts take training tasks only, got {leaked[0]!r}")
         jobs = _jobs(request, tasks, robots, difficulty)
         parts = {i: jobs[i * _PER_PART : (i + 1) * _PER_PART] for i in missing}
-        planner = PlannerConfig("actor", "mllm", "Actor", str(request.model), temperature=request.temperature)
+        planner = ModelPlanner("actor", "mllm", "Actor", str(request.model), temperature=request.temperature)
         setup = WorkerSetup(planner, difficulty, "fixed", steps="task")
         queue = [job for part in parts.values() for job in part]
         with contextlib.closing(scheduled(request.execution, setup, queue, _never, opener)) as results:

@@ -25,8 +25,8 @@ from tqdm import tqdm
 import configs
 from configs.origin import PROVENANCE, origin
 from configs.schema.backend import BackendConfig
-from configs.schema.checks import defaults_of
-from configs.schema.eval import CHAT_KINDS, EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import AnyPlanner, FilePlanner, MemoryPlanner, ModelPlanner
 from data.cluster import import_ray
 from data.code_files import source_digest, split_source
 from data.files import file_hash, read_json, write_text
@@ -128,19 +128,10 @@ def config_hash(cfg: EvalConfig, digest: str) -> str:
         cfg: what to run.
         digest: of the planner's weights or file, "" when it has none.
     """
-    planner = dataclasses.asdict(cfg.planner)
-    for name in ("label", "train", "weights", "source", "memory"):
-        del planner[name]
-    # what a planner's kind does not know, or leaves as it has always been, is no part of its runs' names
-    defaults = defaults_of(PlannerConfig)
-    for name in ("reflection", "replans", "horizon", "history", "body", "examples", "parallel"):
-        if cfg.planner.kind not in CHAT_KINDS and planner[name] == defaults[name]:
-            del planner[name]
-    if planner["blind"] == "none":
-        del planner["blind"]
+    paths = ("label", "train", "weights", "source", "memory")
+    planner = {name: value for name, value in dataclasses.asdict(cfg.planner).items() if name not in paths}
     decides = {"planner": planner, "weights": digest, "robot": dataclasses.asdict(cfg.robot), "start": cfg.start}
-    decides |= {"steps": cfg.steps, "stuck": cfg.stuck, "physics": PHYSICS}
-    decides |= {"feedback": cfg.feedback} if cfg.feedback != "codes" else {}
+    decides |= {"steps": cfg.steps, "stuck": cfg.stuck, "physics": PHYSICS, "feedback": cfg.feedback}
     decides["contingencies"] = _contingencies_hash(cfg)
     if cfg.backend is not None:
         own = {name: getattr(cfg.backend, name) for name in ("max_tokens", "temperature", "image_size")}
@@ -225,12 +216,12 @@ def _metadata(cfg: EvalConfig, jobs: Sequence[EpisodeJob], digest: str, own_hash
         "stuck": cfg.stuck,
         "seed": cfg.seed,
         "tasks": cfg.tasks,
-        "weights": cfg.planner.weights,
+        "weights": getattr(cfg.planner, "weights", None),
         "weights_digest": digest,
         "config_hash": own_hash,
         "command": "python " + " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "planned": [[job.fields.task, job.fields.category, job.fields.trial, job.fields.config_hash] for job in jobs],
-        "reflection": cfg.planner.reflection,
+        "reflection": getattr(cfg.planner, "reflection", "on"),
         "backend": None if cfg.backend is None else dataclasses.asdict(cfg.backend),
         "config": dataclasses.asdict(cfg),
     }
@@ -248,19 +239,19 @@ class _Unasked:
         """Holds nothing."""
 
 
-def _resolved(planner: PlannerConfig, backend: BackendConfig | None) -> tuple[PlannerConfig, str]:
+def _resolved(planner: AnyPlanner, backend: BackendConfig | None) -> tuple[AnyPlanner, str]:
     """The planner with its weights or its file found, and their digest."""
-    if planner.source is not None:
+    if isinstance(planner, FilePlanner):
         file, name = split_source(planner.source, "planner.source", "class")
         source = f"{found(str(file)).absolute()}:{name}"
         planner = dataclasses.replace(planner, source=source)
         # what is wrong fails here, with one message, rather than in every worker
         _ = make_planner(planner) if backend is None else make_chat_planner(planner, backend, _Unasked())
         return planner, source_digest(source)
-    if planner.memory is not None:
+    if isinstance(planner, MemoryPlanner):
         memory = check_memory(found(planner.memory))
         return dataclasses.replace(planner, memory=str(memory.absolute())), file_hash(memory / MEMORY_FILE)[:16]
-    if planner.weights is None:
+    if not isinstance(planner, ModelPlanner):
         return planner, ""
     folder = check_weights(found(planner.weights), planner.train)
     learnt_in = read_json(folder / PROVENANCE).get("physics") if (folder / PROVENANCE).is_file() else None
@@ -340,7 +331,7 @@ def evaluate(cfg: EvalConfig, opener: Opener | None = None, told: bool = True) -
     return EvalRun(folder, metadata, tuple(scores[key] for key in wanted if key in scores), tuple(broken), stopped)
 
 
-def _check_scheduler(cfg: EvalConfig, planner: PlannerConfig) -> None:
+def _check_scheduler(cfg: EvalConfig, planner: AnyPlanner) -> None:
     """What the schedule needs; a missing extra stops here, before anything is written."""
     if cfg.scheduler == "ray":
         import_ray(cfg.ray_address)

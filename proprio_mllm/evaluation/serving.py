@@ -27,7 +27,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from configs.schema.eval import PlannerConfig
+from configs.schema.planner import PlannerConfig
 from data.workers import start_worker
 from interface.observation import Observation
 from proprio_mllm.evaluation.asking import AskingPlanner, ModelDesk, batch_planner

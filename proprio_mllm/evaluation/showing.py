@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from configs.schema.eval import BlindName, FeedbackName
+from configs.schema.eval import FeedbackName
+from configs.schema.planner import BlindName
 from interface.failures import FAILED
 from interface.feedback import ActionOutcome, Feedback
 from interface.observation import HistoryItem, Observation, Proprioception

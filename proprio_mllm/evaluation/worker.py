@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
 from configs.schema.backend import BackendConfig
-from configs.schema.eval import DifficultyName, FeedbackName, PlannerConfig, StartName
+from configs.schema.eval import DifficultyName, FeedbackName, StartName
+from configs.schema.planner import BuiltInPlanner, PlannerConfig
 from configs.schema.robot import RobotConfig
 from interface.episode import STEP_LIMIT, EpisodeRecord, Outcome
 from proprio_mllm.backends.protocol import BackendSetupError, ChatReply, ChatRequest, CostCapError, UnreachableError
@@ -212,7 +213,7 @@ class EpisodeWorker:
             opened.append(self._opener(self.setup, job, self.planner))
             return opened[-1]
 
-        showing = Showing(self.setup.planner.blind, self.setup.feedback)
+        showing = Showing(getattr(self.setup.planner, "blind", "none"), self.setup.feedback)
         episode = episode_steps(open_session, job.fields, task.instruction, limits, job.episode_seed, watch, showing)
         one = _Running(job, episode, recorder, opened)
         one.go_on(None)
@@ -373,7 +374,7 @@ def _broken(result: EpisodeResult) -> bool:
 def _planner(setup: WorkerSetup) -> Planner:
     if setup.server is not None:
         return setup.server.connect()
-    if setup.planner.kind == "expert":
+    if isinstance(setup.planner, BuiltInPlanner) and setup.planner.kind == "expert":
         from proprio_mllm.evaluation.privileged import ExpertPlanner
 
         return ExpertPlanner(setup.planner.image_size)

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from configs.compose import group_file, groups
-from configs.schema.eval import CHAT_KINDS, ExperimentConfig
+from configs.schema.eval import ExperimentConfig
+from configs.schema.planner import CHAT_KINDS
 from data.files import write_text
 from proprio_mllm.report.figures import distribution_figures, failure_figure
 from proprio_mllm.report.paper import PAPER_ROWS, paper_ablation, paper_main, paper_replanning

@@ -13,7 +13,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.checks import defaults_of
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import PLANNER_KINDS, BuiltInPlanner, ModelPlanner, PlannerConfig
 from configs.validate import build
 from interface.episode import EpisodeRecord
 from interface.failures import INVALID_OUTPUT
@@ -67,9 +69,8 @@ class RunTasks:
         self._run = run
         config = dict(run.metadata["config"])
         # options that a planner had then and has no more say nothing about its tasks
-        config["planner"] = {
-            name: value for name, value in config["planner"].items() if name in PlannerConfig.__dataclass_fields__
-        }
+        known = PLANNER_KINDS.get(config["planner"].get("kind", ""), PlannerConfig).__dataclass_fields__
+        config["planner"] = {name: value for name, value in config["planner"].items() if name in known}
         self.cfg = build(EvalConfig, config, f"{run.folder}/run.json: config")
         # The whole file: which tasks come first may have changed since, which task is meant has not.
         everything = dataclasses.replace(self.cfg, category="all", limit=None, trials=1)
@@ -200,6 +201,7 @@ class Reenactment:
 
 def _picture_size(planner: PlannerConfig) -> int:
     """Side of the planner's picture: a model's own while its folder is there, else the configuration's."""
-    if planner.weights is not None and (path := Path(planner.weights) / "config.json").is_file():
-        return int(json.loads(path.read_text(encoding="utf-8")).get("image_size", planner.image_size))
-    return planner.image_size
+    usual = int(getattr(planner, "image_size", defaults_of(BuiltInPlanner)["image_size"]))
+    if isinstance(planner, ModelPlanner) and (path := Path(planner.weights) / "config.json").is_file():
+        return int(json.loads(path.read_text(encoding="utf-8")).get("image_size", usual))
+    return usual

@@ -10,7 +10,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from conftest import FakeSession, make_task
 
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import BuiltInPlanner
 from configs.schema.robot import RobotConfig
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.report.runs import write_report
@@ -31,7 +32,7 @@ def main(output: Path) -> None:
     if not tasks.exists():
         write_tasks([make_task(f"t{i}", categories[i % 3], budget=12) for i in range(12)], tasks)
     cfg = EvalConfig(
-        planner=PlannerConfig("random", "random", "Random", image_size=28),
+        planner=BuiltInPlanner("random", "random", "Random", image_size=28),
         robot=RobotConfig("h1"),
         trials=2,
         workers=0,

@@ -9,7 +9,8 @@ from collections import deque
 import numpy as np
 import pytest
 
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import BuiltInPlanner, FilePlanner
 from configs.schema.robot import RobotConfig
 from interface.episode import EpisodeRecord, Outcome
 from interface.observation import Observation
@@ -53,7 +54,7 @@ def plain(records) -> list[EpisodeRecord]:
 def cfg(tmp_path, task) -> EvalConfig:
     (tmp_path / "own.py").write_text(OWN)
     write_tasks([task(f"t{i}", "single", budget=4 + i) for i in range(5)], tmp_path / "tasks.jsonl")
-    planner = PlannerConfig("own", "file", "Own", source=f"{tmp_path / 'own.py'}:Own")
+    planner = FilePlanner("own", "file", "Own", source=f"{tmp_path / 'own.py'}:Own")
     return EvalConfig(planner, RobotConfig("h1"), workers=0, tasks=str(tmp_path / "tasks.jsonl"), output=str(tmp_path / "out"))
 
 
@@ -125,9 +126,9 @@ def test_planners_that_answer_one_at_a_time_are_refused(cfg, session, tmp_path) 
     with pytest.raises(ValueError, match="planner 'own' answers one episode at a time"):
         run(cfg, session, tmp_path, "x", batch=2)
     with pytest.raises(ValueError, match="batch 4 with planner kind 'random'"):
-        EvalConfig(PlannerConfig("random", "random", "Random"), RobotConfig("h1"), batch=4)
+        EvalConfig(BuiltInPlanner("random", "random", "Random"), RobotConfig("h1"), batch=4)
     with pytest.raises(ValueError, match="one episode at a time"):
-        batch_planner(PlannerConfig("random", "random", "Random"))
+        batch_planner(BuiltInPlanner("random", "random", "Random"))
     for change, said in (
         ({"batch": 0}, r"batch 0 outside \[1, 1024\]"),
         ({"scheduler": "ray", "workers": 0}, "workers 0 must be positive with scheduler=ray"),

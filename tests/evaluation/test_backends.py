@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from configs.schema.backend import BackendConfig
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import FilePlanner, PlainPlanner
 from configs.schema.robot import RobotConfig
 from data.code_files import CodeFileError
 from interface.episode import EpisodeRecord, Outcome
@@ -78,7 +79,7 @@ def cfg(tmp_path: Path, task) -> EvalConfig:
     write_tasks([task(f"t{i}", "single", budget=4 + i % 3) for i in range(9)], tmp_path / "tasks.jsonl")
     backend = BackendConfig("scripted", "script", source=f"{tmp_path / 'script.py'}:answer", cache=None)
     return EvalConfig(
-        PlannerConfig("gpt4o", "plain", "GPT-4o"),
+        PlainPlanner("gpt4o", "plain", "GPT-4o"),
         RobotConfig("h1"),
         workers=0,
         steps="task",
@@ -182,7 +183,7 @@ OWN_PROMPT = Path(__file__).parents[2] / "examples" / "own_prompt.py"
 
 @pytest.mark.parametrize("threads", [1, 4])
 def test_a_prompt_of_ones_own_asks_the_runs_backend(cfg, session, threads: int) -> None:
-    own = PlannerConfig("brief", "file", "Brief", source=f"{OWN_PROMPT}:Brief")
+    own = FilePlanner("brief", "file", "Brief", source=f"{OWN_PROMPT}:Brief")
     result = run(cfg, session, planner=own, backend=script(cfg, "brief"), threads=threads)
     assert not result.broken
     assert len(result.records) == 9
@@ -196,7 +197,7 @@ def test_a_prompt_of_ones_own_asks_the_runs_backend(cfg, session, threads: int) 
 
 
 def test_samples_of_a_prompt_of_ones_own_are_its_episodes(cfg, session, tmp_path) -> None:
-    own = PlannerConfig("brief", "file", "Brief", source=f"{OWN_PROMPT}:Brief")
+    own = FilePlanner("brief", "file", "Brief", source=f"{OWN_PROMPT}:Brief")
     warm = dataclasses.replace(script(cfg, "brief"), temperature=0.7, cache=str(tmp_path / "replies.sqlite"))
     first = run(cfg, session, planner=own, backend=warm, trials=2)
     again = run(cfg, session, planner=own, backend=warm, trials=2, threads=3, output=str(tmp_path / "again"))
@@ -205,7 +206,7 @@ def test_samples_of_a_prompt_of_ones_own_are_its_episodes(cfg, session, tmp_path
 
 
 def test_a_planner_of_a_file_that_takes_no_backend_is_refused_with_one(cfg, session, tmp_path) -> None:
-    own = PlannerConfig("near", "file", "Near", source=f"{OWN_PROMPT.with_name('own_planner.py')}:Nearby")
+    own = FilePlanner("near", "file", "Near", source=f"{OWN_PROMPT.with_name('own_planner.py')}:Nearby")
     with pytest.raises(CodeFileError, match=r"Nearby\(backend, options\) failed: TypeError"):
         run(cfg, session, planner=own)
     with pytest.raises(ValueError, match=r"planner\.body True with planner kind 'file' without a backend; allowed: False"):

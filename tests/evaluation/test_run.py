@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 import configs
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import BuiltInPlanner, FilePlanner, ModelPlanner
 from configs.schema.robot import RobotConfig
 from interface.episode import STEP_LIMIT, Outcome
 from proprio_mllm.evaluation import run as running
@@ -33,7 +34,7 @@ def cfg(tmp_path, task) -> EvalConfig:
     path = tmp_path / "tasks.jsonl"
     write_tasks([task(f"t{i}", category) for i, category in enumerate(("single", "single", "optional", "essential"))], path)
     return EvalConfig(
-        planner=PlannerConfig("random", "random", "Random", image_size=28),
+        planner=BuiltInPlanner("random", "random", "Random", image_size=28),
         robot=RobotConfig("h1"),
         workers=0,
         tasks=str(path),
@@ -63,7 +64,7 @@ def test_weights_of_another_physics_are_told(cfg, session, tmp_path, caplog) -> 
     weights = tmp_path / "weights"
     weights.mkdir()
     (weights / "config.json").write_text("{}")
-    planner = PlannerConfig("p", "mllm", "P", str(weights), train="python train.py")
+    planner = ModelPlanner("p", "mllm", "P", str(weights), train="python train.py")
     for physics, told in ((PHYSICS, False), (PHYSICS - 1, True), (None, False)):
         (weights / "provenance.json").write_text(json.dumps({"physics": physics}))
         caplog.clear()
@@ -150,7 +151,7 @@ def test_split_takes_the_tasks_of_a_split_and_names_those_there_are(cfg, task) -
 
 
 def test_absent_weights_name_path_and_command(cfg, tmp_path) -> None:
-    planner = PlannerConfig("proprio", "mllm", "P", str(tmp_path / "gone"), train="python train.py stage=all")
+    planner = ModelPlanner("proprio", "mllm", "P", str(tmp_path / "gone"), train="python train.py stage=all")
     with pytest.raises(WeightsError, match=r"gone.*python train\.py stage=all"):
         evaluate(dataclasses.replace(cfg, planner=planner))
 
@@ -178,7 +179,7 @@ def test_a_planner_in_a_file_runs_and_its_edits_count(cfg, session, tmp_path) ->
     path.write_text(OWN.format(name="First", steps=2) + OWN.format(name="Second", steps=1))
 
     def run(name: str):
-        planner = PlannerConfig("own", "file", "Own", source=f"{path}:{name}")
+        planner = FilePlanner("own", "file", "Own", source=f"{path}:{name}")
         return evaluate(dataclasses.replace(cfg, planner=planner), lambda setup, job, planner: session())
 
     first, second = run("First"), run("Second")

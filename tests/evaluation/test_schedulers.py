@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import FilePlanner
 from configs.schema.robot import RobotConfig
 from data.cluster import import_ray, ray_instance
 from interface.episode import EpisodeRecord
@@ -56,10 +57,10 @@ INFO = TaskInfo("turn", "h1", 3)
 
 
 @pytest.fixture(scope="module")
-def own(tmp_path_factory: pytest.TempPathFactory) -> PlannerConfig:
+def own(tmp_path_factory: pytest.TempPathFactory) -> FilePlanner:
     path = tmp_path_factory.mktemp("planner") / "own_of_schedulers.py"
     path.write_text(OWN)
-    return PlannerConfig("own", "file", "Own", source=f"{path}:Own")
+    return FilePlanner("own", "file", "Own", source=f"{path}:Own")
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,7 @@ def ray() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def cfg(own: PlannerConfig, tmp_path_factory: pytest.TempPathFactory) -> EvalConfig:
+def cfg(own: FilePlanner, tmp_path_factory: pytest.TempPathFactory) -> EvalConfig:
     folder = tmp_path_factory.mktemp("runs")
     write_tasks([dataclasses.replace(task, time_limit=1) for task in load_benchmark()[:3]], folder / "tasks.jsonl")
     return EvalConfig(own, RobotConfig("h1"), workers=0, tasks=str(folder / "tasks.jsonl"), output=str(folder / "serial"))
@@ -157,7 +158,7 @@ def said(planner: Planner, seed: int) -> list[str]:
     return [planner.step(observation("turn"), None).text for _ in range(4)]
 
 
-def test_a_models_process_answers_callers_apart_and_is_started_again(own: PlannerConfig) -> None:
+def test_a_models_process_answers_callers_apart_and_is_started_again(own: FilePlanner) -> None:
     with model_processes(own, 2, ()) as models:
         (model,) = models.processes
         one, other = models.server.connect(), models.server.connect()
@@ -179,7 +180,7 @@ def test_a_models_process_answers_callers_apart_and_is_started_again(own: Planne
     assert not Path(model.server.path).exists()
 
 
-def test_callers_are_spread_over_the_gpus(own: PlannerConfig) -> None:
+def test_callers_are_spread_over_the_gpus(own: FilePlanner) -> None:
     with model_processes(own, 2, ("0", "1")) as models:
         callers = [models.server.connect() for _ in range(4)]
         assert len({tuple(said(one, 1)) for one in callers}) == 1
@@ -209,7 +210,7 @@ def test_gpus_are_those_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.slow
-def test_a_models_actor_is_started_again(own: PlannerConfig, ray: Any) -> None:
+def test_a_models_actor_is_started_again(own: FilePlanner, ray: Any) -> None:
     class Caller:
         def __init__(self, server: Any) -> None:
             self.planner = server.connect()

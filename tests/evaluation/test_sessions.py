@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import BuiltInPlanner
 from configs.schema.robot import RobotConfig
 from interface.episode import Outcome
 from proprio_mllm.evaluation.privileged import ExpertPlanner
@@ -39,7 +40,7 @@ TASK = Task(
 def cfg(tmp_path: Path) -> EvalConfig:
     write_tasks([TASK], tmp_path / "tasks.jsonl")
     return EvalConfig(
-        planner=PlannerConfig("random", "random", "Random"),
+        planner=BuiltInPlanner("random", "random", "Random"),
         robot=RobotConfig("h1"),
         workers=0,
         steps="task",

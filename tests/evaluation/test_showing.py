@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from configs.compose import compose
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import BuiltInPlanner
 from configs.schema.robot import RobotConfig
 from configs.validate import ConfigError, build
 from interface.observation import HistoryItem
@@ -90,8 +91,8 @@ def test_what_is_hidden_is_in_a_runs_name() -> None:
 
 
 def test_planners_without_eyes_are_not_blinded() -> None:
-    with pytest.raises(ValueError, match="kind 'scripted' with blind 'both'"):
-        PlannerConfig("s", "scripted", "S", blind="both")
+    with pytest.raises(ConfigError, match=r"planner\.blind: unknown key with kind 'scripted'"):
+        build(EvalConfig, compose("eval", ["planner=scripted", "planner.blind=both"]))
     with pytest.raises(ConfigError, match="feedback"):
         build(EvalConfig, compose("eval", ["planner=scripted", "feedback=none"]))
-    assert EvalConfig(PlannerConfig("s", "scripted", "S"), RobotConfig("h1"), feedback="bit").feedback == "bit"
+    assert EvalConfig(BuiltInPlanner("s", "scripted", "S"), RobotConfig("h1"), feedback="bit").feedback == "bit"

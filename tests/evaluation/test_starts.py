@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import FilePlanner
 from configs.schema.robot import RobotConfig
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.evaluation.seeds import episode_seed, stream
@@ -85,7 +86,7 @@ def _images(folder, name: str, task: Task) -> list[np.ndarray]:
         f"        np.save(Path({str(seen)!r}) / str(Looking.trials), observation.image)\n"
         "        return parse_reply('Done()')\n"
     )
-    planner = PlannerConfig(name, "file", name, source=f"{folder / name}.py:Looking")
+    planner = FilePlanner(name, "file", name, source=f"{folder / name}.py:Looking")
     cfg = EvalConfig(
         planner, RobotConfig("h1"), start="random", trials=2, workers=0, tasks=str(folder / "tasks.jsonl"), output=str(folder)
     )

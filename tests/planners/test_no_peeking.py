@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from configs.schema.eval import PlannerConfig
+from configs.schema.planner import ModelPlanner
 from interface.feedback import Feedback
 from interface.observation import Observation
 from interface.steps import PlanStep
@@ -141,7 +141,7 @@ def planners() -> dict[str, Callable[[list[Script]], Planner]]:
     return {
         "random": lambda scripts: RandomPlanner(112),
         "scripted": lambda scripts: ScriptedPlanner(112),
-        "mllm": lambda scripts: make_planner(PlannerConfig("m", "mllm", "M", str(WEIGHTS))),
+        "mllm": lambda scripts: make_planner(ModelPlanner("m", "mllm", "M", str(WEIGHTS))),
         "plain": chat(PlainPlanner, body=True),
         "dag_plan": chat(DagPlanner, graph_of),
     }

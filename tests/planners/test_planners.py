@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from configs.compose import CONFIG_DIR, compose
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import CHAT_KINDS, PLANNER_KINDS, BuiltInPlanner
 from configs.validate import build
 from interface.actions import ACTIONS
 from interface.observation import Camera, Observation, Proprioception
 from interface.steps import PlanStep
 from proprio_mllm.planners.protocol import Planner, TaskInfo, WeightsError, check_weights, parse_reply
 from proprio_mllm.planners.random_planner import RandomPlanner
-from proprio_mllm.planners.registry import CHAT_PLANNERS, PLANNERS, make_planner
+from proprio_mllm.planners.registry import CHAT_PLANNERS, make_planner
 
 INFO = TaskInfo("pick up the mug", "h1", 9)
 
@@ -84,13 +85,14 @@ def test_every_configured_planner_is_made_somewhere() -> None:
         assert cfg.planner.name == path.stem
         assert (cfg.backend is not None) == (cfg.planner.kind in CHAT_PLANNERS)
         kinds.add(cfg.planner.kind)
-    assert kinds == {*PLANNERS, *CHAT_PLANNERS, "expert"}
+    assert kinds == set(PLANNER_KINDS)
+    assert set(CHAT_KINDS) == set(CHAT_PLANNERS)
 
 
 def test_registry() -> None:
-    assert isinstance(make_planner(PlannerConfig("r", "random", "R", image_size=56)), Planner)
+    assert isinstance(make_planner(BuiltInPlanner("r", "random", "R", image_size=56)), Planner)
     with pytest.raises(ValueError, match=r"'expert' is not made here; allowed: file, mllm, random, scripted"):
-        make_planner(PlannerConfig("e", "expert", "E"))
+        make_planner(BuiltInPlanner("e", "expert", "E"))
 
 
 def test_weights_are_checked(tmp_path: Path) -> None:
@@ -103,17 +105,19 @@ def test_weights_are_checked(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kind": "mllm"}, "weights None"),
-        ({"temperature": -1.0}, "temperature -1.0"),
+        ({"kind": "mllm"}, "planner.weights: missing"),
+        ({"kind": "mllm", "weights": "x", "temperature": -1.0}, "temperature -1.0"),
         ({"name": "a b"}, "'a b'"),
-        ({"weights": "x"}, "weights 'x'"),
-        ({"kind": "file"}, "source None"),
-        ({"source": "x.py:X"}, "source 'x.py:X'"),
+        ({"weights": "x"}, "planner.weights: unknown key with kind 'random'; allowed: image_size, kind"),
+        ({"kind": "file"}, "planner.source: missing"),
+        ({"kind": "rap", "memory": "x", "examples": 0}, "examples 0 must be at least 1"),
+        ({"kind": "plains"}, "planner.kind: 'plains' is not allowed; .*did you mean 'plain'"),
     ],
 )
 def test_config_refuses(change: dict, message: str) -> None:
+    planner = {"name": "p", "kind": "random", "label": "P"} | change
     with pytest.raises(ValueError, match=message):
-        build(PlannerConfig, {"name": "p", "kind": "random", "label": "P"} | change)
+        build(EvalConfig, {"planner": planner, "robot": {"name": "h1"}})
 
 
 def test_planners_never_import_the_simulator() -> None:

@@ -12,7 +12,8 @@ import yaml
 from peft import PeftModel
 
 from configs.compose import compose
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import ModelPlanner
 from configs.schema.robot import RobotConfig
 from configs.validate import build
 from interface.observation import Observation
@@ -62,7 +63,7 @@ def test_words_alone_plan(first: Observation) -> None:
 
 @pytest.mark.parametrize("name", PARTS)
 def test_it_plans_with_the_parts_of_its_name(name: str, first: Observation) -> None:
-    planner = make_planner(PlannerConfig("m", "mllm", "M", str(WEIGHTS / name)))
+    planner = make_planner(ModelPlanner("m", "mllm", "M", str(WEIGHTS / name)))
     assert isinstance(planner, WordsPlanner)
     cfg = planner.model.cfg
     assert not isinstance(planner.model.vlm, PeftModel), "its adapter is folded in"
@@ -103,7 +104,7 @@ def test_the_model_plans_alike_alone_and_in_a_batch(tmp_path: Path) -> None:
     everything = load_benchmark()
     tasks = [dataclasses.replace(everything[i * len(everything) // 3], time_limit=1 + i) for i in range(3)]
     write_tasks(tasks, tmp_path / "tasks.jsonl")
-    planner = PlannerConfig("proprio", "mllm", "P", str(WEIGHTS / "full"))
+    planner = ModelPlanner("proprio", "mllm", "P", str(WEIGHTS / "full"))
     cfg = EvalConfig(planner, RobotConfig("h1"), workers=0, tasks=str(tmp_path / "tasks.jsonl"), output=str(tmp_path / "1"))
     runs = [evaluate(cfg), evaluate(dataclasses.replace(cfg, batch=3, output=str(tmp_path / "3")))]
     alone, together = ([dataclasses.replace(r, planner_s=0.0, wall_s=0.0) for r in run.records] for run in runs)

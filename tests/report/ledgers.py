@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import BuiltInPlanner, FilePlanner
 from configs.schema.robot import RobotConfig
 from interface.episode import EpisodeRecord, Outcome
 from interface.failures import FailureCategory
@@ -71,9 +72,9 @@ def step(*outcomes: dict[str, Any], text: str = "") -> dict[str, Any]:
 def _config(tmp_path: Path, tasks: Sequence[Task], robot: str, source: str | None = None) -> EvalConfig:
     tmp_path.mkdir(parents=True, exist_ok=True)
     write_tasks(tasks, tmp_path / "tasks.jsonl")
-    planner = PlannerConfig("random", "random", "Random")
+    planner = BuiltInPlanner("random", "random", "Random")
     if source is not None:
-        planner = PlannerConfig("own", "file", f"Own {HOSTILE}", source=source)
+        planner = FilePlanner("own", "file", f"Own {HOSTILE}", source=source)
     return EvalConfig(planner, RobotConfig(robot), workers=0, tasks=str(tmp_path / "tasks.jsonl"), output=str(tmp_path))
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from configs.schema.backend import BackendConfig
-from configs.schema.eval import PlannerConfig
+from configs.schema.planner import AskingPlanner
+
+_OF_PLANNER: Final = ("replans", "horizon", "history", "body", "examples", "memory", "parallel")
 
 
 @dataclass(frozen=True, slots=True)
 class ChatOptions:
-    """See `PlannerConfig` and `BackendConfig`, whose fields these are.
+    """See `configs.schema.planner` and `BackendConfig`, whose fields these are.
 
     Attributes:
         image_size: side of the head view, pixels.
@@ -39,18 +42,7 @@ class ChatOptions:
     parallel: bool = True
 
     @staticmethod
-    def of(planner: PlannerConfig, backend: BackendConfig) -> ChatOptions:
+    def of(planner: AskingPlanner, backend: BackendConfig) -> ChatOptions:
         """From the two configurations."""
-        return ChatOptions(
-            backend.image_size,
-            backend.max_tokens,
-            backend.temperature,
-            planner.reflection == "on",
-            planner.replans,
-            planner.horizon,
-            planner.history,
-            planner.body,
-            planner.examples,
-            planner.memory,
-            planner.parallel,
-        )
+        own = {name: getattr(planner, name) for name in _OF_PLANNER if hasattr(planner, name)}
+        return ChatOptions(backend.image_size, backend.max_tokens, backend.temperature, planner.reflection == "on", **own)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from configs.schema.backend import BackendConfig
-from configs.schema.eval import PlannerConfig
+from configs.schema.planner import MemoryPlanner
 from proprio_mllm.backends.protocol import BackendError, ChatReply, ChatRequest
 from proprio_mllm.backends.structured import strict_schema
 from proprio_mllm.planners.chat.options import ChatOptions
@@ -236,6 +236,6 @@ def test_it_needs_a_memory() -> None:
 
 @pytest.mark.parametrize("kind", ["llm_planner", "rap"])
 def test_the_registry_makes_both(kind, blind_memory_folder: Path) -> None:
-    cfg = PlannerConfig("p", kind, "P", examples=2, memory=str(blind_memory_folder))
+    cfg = MemoryPlanner("p", kind, "P", examples=2, memory=str(blind_memory_folder))
     backend = BackendConfig("scripted", "b", source="x.py:f")
     assert isinstance(make_chat_planner(cfg, backend, Script([])), Planner)

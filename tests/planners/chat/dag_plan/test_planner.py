@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from configs.compose import compose
-from configs.schema.eval import EvalConfig, PlannerConfig
+from configs.schema.eval import EvalConfig
+from configs.schema.planner import PlainPlanner
 from configs.validate import build
 from interface.failures import FailureCategory
 from interface.feedback import ActionOutcome, Feedback
@@ -375,5 +376,4 @@ def test_it_is_configured_by_name_and_only_it_knows_one_arm_at_a_time() -> None:
     planner = make_chat_planner(cfg.planner, cfg.backend, Script([]))
     assert isinstance(planner, DagPlanner)
     assert ChatOptions.of(cfg.planner, cfg.backend).parallel is False
-    with pytest.raises(ValueError, match="kind 'plain' with parallel False"):
-        PlannerConfig("p", "plain", "P", parallel=False)
+    assert not hasattr(PlainPlanner("p", "plain", "P"), "parallel")
