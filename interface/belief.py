@@ -112,6 +112,11 @@ class Belief:
             belief.last = events
         return belief
 
+    @property
+    def failed(self) -> Event | None:
+        """What went wrong in the newest step, None when nothing did."""
+        return next((event for event in self.last if not event.ok), None)
+
     def holds_furniture(self) -> Arm | None:
         """The arm that holds a door open."""
         return next((arm for arm, item in self.state.held.items() if item in self.state.self_closing), None)

@@ -62,8 +62,8 @@ class ModelPlanner(PlannerConfig):
             something where it has been, end the task with a step that did nothing, and take a third time what was refused
             twice.
         blind: hides the picture, the robot's own body, or both (`proprio_mllm.evaluation.showing`).
-        reflection: whether failures are reflected on: `off` leaves failed steps out of the log that a stored model reads;
-            with `on`, planners that ask a backend ask once more for cause, change and new steps.
+        reflection: whether failures are reflected on: a stored model says of what type they are and what changes before it
+            plans; planners that ask a backend ask once more for cause, change and new steps.
     """
 
     kind: Literal["mllm"]

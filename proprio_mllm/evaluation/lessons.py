@@ -4,7 +4,8 @@ The teacher is the scripted planner: what it answers is a function of what it is
 so a model that sees the same can learn it. Part of the steps that are taken are mistakes; the teacher's answer to what follows
 from them is what is learnt. Episodes are made in the text world, or read from logs of the simulator, which are told in the same
 words. In half of the episodes some object types bear made-up names, in the instruction and in their ids,
-so that things are named by reading and not by heart.
+so that things are named by reading and not by heart. Half of the episodes reflect on every failure, the others on none. In
+some the log tells failures as one bit, to teacher and learner alike.
 
 This is the bridge that `train.py` wires: training asks for the episode of a seed and knows neither worlds nor planners.
 """
@@ -27,6 +28,7 @@ from interface.failures import FAILURES
 from interface.observation import HistoryItem
 from interface.sightings import Shown, Sightings
 from interface.steps import Action, PlanStep
+from proprio_mllm.evaluation.showing import as_bit
 from proprio_mllm.model.wording import (
     ID_NUMBERS,
     MARKERS,
@@ -37,6 +39,7 @@ from proprio_mllm.model.wording import (
     log_words,
     number_words,
     prefix_words,
+    reflection_words,
     state_words,
     text_words,
 )
@@ -54,6 +57,9 @@ _MAX_STEPS: Final = 40
 #: How often an instruction says where a thing is that is in view; the simulator's do, where a robot sees more than was thought.
 _TOLD_IN_VIEW: Final = 0.3
 _RENAMED: Final = 0.5
+#: Share of episodes that reflect, and of those in which a log has `Failed` in place of every failure code.
+_REFLECTING: Final = 0.5
+_AS_BIT: Final = 0.1
 _MOST_RENAMED: Final = 5
 _SYLLABLES: Final = ("ba", "do", "fi", "gu", "ka", "lo", "mi", "nu", "pe", "ra", "so", "tu", "va", "wo", "xi", "zu")
 #: Numbers of instructions; counts of things.
@@ -130,10 +136,12 @@ class Lessons:
         rng, world = episode.rng, episode.world
         task = episode.task
         things = dict.fromkeys((*task.objects, *task.objects.values(), *episode.scene.furniture))
-        teacher, record = ScriptedPlanner(), _Record(_new_names(tuple(things), set(task.objects), rng))
+        names = _new_names(tuple(things), set(task.objects), rng)
+        reflects, bits = (bool(one) for one in rng.random(2) < (_REFLECTING, _AS_BIT))
+        teacher, record = ScriptedPlanner(), _Record(names, reflects)
         mistakes = float(rng.choice(MISTAKES))
         while episode.steps < _MAX_STEPS:
-            shown = episode.shown()
+            shown = _in_bits(episode.shown()) if bits else episode.shown()
             if world.done():
                 record.look(shown, PlanStep((Action("Done"),)), "Done", "")
                 break
@@ -161,7 +169,9 @@ class Lessons:
             rng, some = rng_for("lesson of a log", seed), test if seed < 0 else train
             looks, done = some[int(rng.integers(len(some)))]
             known = looks[-1].known_objects
-            return _of_log(looks, done, _new_names(known, set(known) - set(looks[0].known_objects), rng))
+            names = _new_names(known, set(known) - set(looks[0].known_objects), rng)
+            reflects, bits = (bool(one) for one in rng.random(2) < (_REFLECTING, _AS_BIT))
+            return _of_log([_in_bits(one) for one in looks] if bits else looks, done, names, reflects)
 
         return episode
 
@@ -170,17 +180,22 @@ class Lessons:
         reader, targets = ShardReader(folder, "demos"), dict[str, list[PlanStep]]()
         for episode, target in zip(reader.column("episode"), reader.column("target"), strict=True):
             targets.setdefault(episode, []).append(PlanStep.parse(target))
-        return tuple(_of_log(looks, done, {}, targets[name]) for name, (looks, done) in _logs(folder).items())
+        logs = enumerate(_logs(folder).items())
+        return tuple(_of_log(looks, done, {}, number % 2 == 0, targets[name]) for number, (name, (looks, done)) in logs)
+
+
+def _in_bits(shown: Shown) -> Shown:
+    return replace(shown, history=tuple(map(as_bit, shown.history)))
 
 
 def _of_log(
-    looks: Sequence[Shown], done: bool, names: Mapping[str, str], targets: Sequence[PlanStep] | None = None
+    looks: Sequence[Shown], done: bool, names: Mapping[str, str], reflects: bool, targets: Sequence[PlanStep] | None = None
 ) -> WordEpisode:
     """The episode in which a planner was shown this, and whose goals were met at its end or not, under other names.
 
     Its steps are `targets`, or what the teacher says to what was shown.
     """
-    teacher, record = ScriptedPlanner(), _Record(names)
+    teacher, record = ScriptedPlanner(), _Record(names, reflects)
     for number, shown in enumerate(looks):
         step, job = teacher.decide(shown)
         if done and number + 1 == len(looks):
@@ -206,10 +221,10 @@ def _logs(folder: Path) -> dict[str, tuple[list[Shown], bool]]:
 
 
 class _Record:
-    """Writes an episode down in words, under other names where wanted."""
+    """Writes an episode down in words, under other names and with reflections where wanted."""
 
-    def __init__(self, names: Mapping[str, str]) -> None:
-        self._names = names
+    def __init__(self, names: Mapping[str, str], reflects: bool) -> None:
+        self._names, self._reflects = names, reflects
         self._sightings = Sightings()
         self._prefix: tuple[str, ...] = ()
         self._turns: list[WordTurn] = []
@@ -226,8 +241,9 @@ class _Record:
         actions = tuple(
             one if one.object_id is None else replace(one, object_id=self._id(one.object_id)) for one in step.actions
         )
-        answer = answer_words(verb, self._id(target) if target else target, PlanStep(actions))
-        self._turns.append(WordTurn(state_words(self._sightings), answer, ()))
+        reflection = reflection_words(self._sightings.belief.failed, PlanStep(actions)) if self._reflects else ()
+        answer = answer_words(verb, self._id(target) if target else target, PlanStep(actions), reflection)
+        self._turns.append(WordTurn(state_words(self._sightings, self._reflects), answer, ()))
 
     def episode(self) -> WordEpisode:
         """What was written."""

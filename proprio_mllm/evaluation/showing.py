@@ -43,7 +43,7 @@ class Showing:
         if self.blind in ("motion", "both"):
             observation = dataclasses.replace(observation, proprioception=_numb(observation.proprioception))
         if self.feedback == "bit":
-            observation = dataclasses.replace(observation, history=tuple(map(_told, observation.history)))
+            observation = dataclasses.replace(observation, history=tuple(map(as_bit, observation.history)))
         return observation
 
     def outcome(self, feedback: Feedback | None) -> Feedback | None:
@@ -66,7 +66,8 @@ def _numb(body: Proprioception) -> Proprioception:
     return Proprioception(np.zeros_like(body.motion), body.fps, joints, bodies)
 
 
-def _told(item: HistoryItem) -> HistoryItem:
+def as_bit(item: HistoryItem) -> HistoryItem:
+    """A step with `Failed` in place of every failure code."""
     parts = [part.rpartition(" ") for part in item.feedback.split("; ")]
     return HistoryItem(item.step, "; ".join(f"{action} {code if code == 'ok' else FAILED}" for action, _, code in parts))
 

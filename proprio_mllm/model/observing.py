@@ -29,12 +29,14 @@ class EpisodeLog:
         sightings: what has been seen, and what the log says.
         log: tokens of prefix and log.
         told: how many steps are in the log.
+        reflects: whether failures are reflected on.
     """
 
     words: Tokens
     sightings: Sightings = field(default_factory=Sightings)
     log: list[int] = field(default_factory=list)
     told: int = 0
+    reflects: bool = False
 
     def look(self, observation: Seen) -> list[int]:
         """Takes in an observation, at most one step after the last; the tokens of the state, which follow the log."""
@@ -44,7 +46,7 @@ class EpisodeLog:
         else:
             self.log += self.words.tokens(log_words(observation.history[self.told :], self.sightings.new))
         self.told = len(observation.history)
-        return self.words.tokens(state_words(self.sightings))
+        return self.words.tokens(state_words(self.sightings, self.reflects))
 
 
 def view_of(observation: Observation) -> View:

@@ -23,7 +23,7 @@ _SLOT: Final = tuple(f" <word_{number}>" for number in range(SLOTS))
 #: How a text says the words that open a part of the sequence; other words are said as they are.
 _HEADINGS: Final[Mapping[str, str]] = {
     "room": "\nIn the room:", "did": "\nDone:", "now": "\nNow:", "do": "\nDo:", "see": "; in view:", "fail": "; failed:",
-    "tried": "; tried:", "&": " and", "unseen": " something unseen",
+    "tried": "; tried:", "&": " and", "unseen": " something unseen", "why": "; why did it fail?",
 }  # fmt: skip
 _GLUED: Final = (END, ",", ";", ":", "_")
 

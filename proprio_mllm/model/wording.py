@@ -3,8 +3,8 @@
     prefix   robot, instruction, furniture and what else is known at the start
     log      per step: the actions as they were taken, their codes, what came into view
     now      before an answer, and seen by that answer alone: the hands, where the robot stands, what is in view, where things
-             are or were last seen, the states of doors and switches, what was tried from here
-    answer   the sub-goal (verb and thing), then the step
+             are or were last seen, the states of doors and switches, what was tried from here; `why` asks for reflection
+    answer   after `why`, of what type the failure is and what changes; the sub-goal (verb and thing), then the step
 
 Ids and instructions share their words (`DiningTable_1` is `dining table _1`), so that a thing is named by copying, not by
 remembering. Nothing is in these words that an `Observation` does not hold; `now` is computed from the log by the table of
@@ -23,12 +23,12 @@ from typing import Final
 from interface.actions import ACTIONS, ActionKind
 from interface.belief import ARM_SPECIFIC, UNKNOWN, Belief
 from interface.bodies import Arm
-from interface.effects import Condition
-from interface.failures import FAILED
+from interface.effects import Condition, Rise
+from interface.failures import FAILED, FAILURES, FailureCategory, FailureCode
 from interface.observation import HistoryItem
 from interface.sightings import Seen, Sightings
 from interface.steps import Action, PlanStep
-from interface.symbolic import events_of
+from interface.symbolic import Event, events_of
 
 Words = tuple[str, ...]
 
@@ -36,11 +36,15 @@ Words = tuple[str, ...]
 END: Final = "."
 #: Numbers at the end of ids.
 ID_NUMBERS: Final = tuple(f"_{number}" for number in range(1, 17))
+#: What a reflection names: the paper's failure type, or chance where none is known, and what the next step changes.
+CAUSES: Final = (*(str(one).partition("_")[0] for one in FailureCategory), "chance")
+CHANGES: Final = ("height", "stance", "arm", "place", "again", "other", "end")
 #: Words of the sequence that are neither of the instruction nor of the grammar of actions.
 MARKERS: Final = (
     END, "&", "room", "see", "did", "now", "do", "unseen", "done", "auto", "left", "right", "both", "empty", "unknown",
     "at", "away", "on", "from", "open", "closed", "off", "sliced", "clean", "dirty", "used", "filled", "drained", "steady",
-    "fail", "tried", "far", "up", "down", "top", "bottom", "low", "blocked", "many", "bent", "s", "ok",
+    "fail", "tried", "far", "up", "down", "top", "bottom", "low", "blocked", "many", "bent", "s", "ok", "why", "so",
+    *CAUSES, *CHANGES,
 )  # fmt: skip
 _TYPE_WORD: Final = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z0-9]+|[A-Z]+")
 _TEXT_WORD: Final = re.compile(r"[a-z0-9]+|[,.;:]")
@@ -130,8 +134,13 @@ def log_words(steps: Sequence[HistoryItem], new: Sequence[str]) -> Words:
     return tuple(words)
 
 
-def state_words(sightings: Sightings) -> Words:
-    """The block before an answer."""
+def state_words(sightings: Sightings, reflects: bool = False) -> Words:
+    """The block before an answer.
+
+    Args:
+        sightings: what is known.
+        reflects: whether a failure is reflected on in the answer.
+    """
     belief, state = sightings.belief, sightings.belief.state
     words = ["now"]
     if state.lifted is not None:
@@ -153,7 +162,7 @@ def state_words(sightings: Sightings) -> Words:
         for name, value in state.conditions[condition].items():
             if word := names[0] if value else names[1]:
                 words += [word, *id_words(name)]
-    return (*words, *_tried(belief), "do")
+    return (*words, *_tried(belief), *(("why",) if reflects and belief.failed is not None else ()), "do")
 
 
 def _thing(name: str) -> Words:
@@ -199,17 +208,40 @@ def _action_words(action: Action) -> Words:
     return tuple(words)
 
 
-def answer_words(verb: str, target: str | None, step: PlanStep) -> Words:
+def reflection_words(failed: Event | None, step: PlanStep) -> Words:
+    """Of what type a failure is, and what the step after it changes; nothing where nothing failed."""
+    if failed is None:
+        return ()
+    kind = FAILURES[FailureCode(failed.code)].category if failed.code in tuple(FailureCode) else None
+    return (CAUSES[-1] if kind is None else str(kind).partition("_")[0], "so", _change(failed.action, step))
+
+
+def _change(failed: Action, step: PlanStep) -> str:
+    head = step.actions[0]
+    if failed in step.actions:
+        return "again"
+    if head.spec.kind is ActionKind.EPISODE:
+        return "end"
+    if head.spec.has_effect(Rise):
+        return "height"
+    if head.spec.kind is ActionKind.BODY:
+        return "stance" if head.object_id in (None, failed.object_id) else "place"
+    same = any((one.name, one.object_id) == (failed.name, failed.object_id) for one in step.actions)
+    return "arm" if same else "other"
+
+
+def answer_words(verb: str, target: str | None, step: PlanStep, reflection: Words = ()) -> Words:
     """The sub-goal and the step.
 
     Args:
         verb: what is to be done next, a name of the table of actions.
         target: its object, None while that has not been seen; empty for verbs without one.
         step: what to do now.
+        reflection: from `reflection_words`, where the state asked why.
     """
     thing: Words = ("unseen",) if target is None else id_words(target) if target else ()
     actions = [word for number, one in enumerate(step.actions) for word in (*(("&",) if number else ()), *_action_words(one))]
-    return (verb, *thing, "do", *actions, END)
+    return (*reflection, verb, *thing, "do", *actions, END)
 
 
 def read_step(words: Sequence[str], ids: Mapping[Words, str]) -> PlanStep:

@@ -14,12 +14,14 @@ from interface.belief import Belief
 from interface.bodies import Arm
 from interface.effects import Condition, Grasp, Walk
 from interface.steps import Action
-from proprio_mllm.model.wording import END, id_words, number_words
+from proprio_mllm.model.wording import CAUSES, CHANGES, END, id_words, number_words
 from proprio_mllm.planners.furniture import CONTAINERS, FIXTURES, SEATS, SURFACES
 from proprio_mllm.planners.scripted.words import type_of
 
 #: Verbs whose object is never furniture.
 _OF_MOVABLES: Final = frozenset(("Pick", "Lift", "Slice", "Pour", "UseUp"))
+#: The words of a reflection, place by place.
+_REFLECTION: Final = (CAUSES, ("so",), CHANGES)
 
 
 class AnswerGrammar:
@@ -30,16 +32,22 @@ class AnswerGrammar:
         belief: what is known of the world; left out are actions that are bound to be refused by it, walks in search of
             something to where it was looked for, and the end of the task unless hands have just done something. None leaves
             out none.
+        reflects: whether an answer begins with a reflection.
     """
 
-    def __init__(self, ids: Sequence[str], belief: Belief | None = None) -> None:
+    def __init__(self, ids: Sequence[str], belief: Belief | None = None, reflects: bool = False) -> None:
         self.ids: Mapping[tuple[str, ...], str] = {id_words(name): name for name in ids}
-        self._belief = belief
+        self._belief, self._reflection = belief, _REFLECTION if reflects else ()
+        #: Words of the reflection.
+        self.reflected = len(self._reflection)
         places = [name for name in ids if type_of(name) in (*SURFACES, *SEATS, *CONTAINERS)]
         self._searched = frozenset() if belief is None else _searched(places, belief)
 
     def allowed(self, words: Sequence[str]) -> list[str]:
         """The words that may follow some words of an answer; none after its end."""
+        if len(words) < self.reflected:
+            return list(self._reflection[len(words)])
+        words = words[self.reflected :]
         if not words:
             return list(ACTIONS)
         if "do" not in words:

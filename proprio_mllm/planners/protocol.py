@@ -9,16 +9,15 @@ Paper: problem formulation (policy over observation, proprioception and feedback
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeVar, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
 from interface.episode import STEP_LIMIT
 from interface.feedback import Feedback
 from interface.observation import HistoryItem, Observation
-from interface.sightings import Seen
 from interface.steps import ActionError, PlanStep
 
 
@@ -154,15 +153,6 @@ def check_weights(folder: str | Path, train: str) -> Path:
 def succeeded(item: HistoryItem) -> bool:
     """Whether every action of an earlier step succeeded."""
     return all(part.endswith(" ok") for part in item.feedback.split("; "))
-
-
-_Seen = TypeVar("_Seen", bound=Seen)
-
-
-def without_failures(observation: _Seen) -> _Seen:
-    """What was seen, with the failed steps taken out of its log."""
-    kept = tuple(item for item in observation.history if succeeded(item))
-    return replace(observation, history=kept)  # type: ignore[type-var]  # whatever is seen is a dataclass
 
 
 def parse_reply(text: str, tokens: int = 0, latency_s: float = 0.0) -> PlannerReply:

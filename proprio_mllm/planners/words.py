@@ -7,9 +7,9 @@ The episode's log is kept as it grows; before each answer comes the block of wha
 of actions and to known ids, so no reply is invalid. Steps that are bound to be refused are not taken, nor a third time what was
 refused twice from the same stance: the model's second choice is.
 
-Paper: Proprio-MLLM as embodied planner, with reflection or without (Table III). The paper's prompt is not published. Here
-reflection is what the model was trained for: failed steps stand in the log with their codes, and the next step answers them.
-Without it they are left out of the log, so that the model sees what its steps have changed and nothing of those that failed.
+Paper: Proprio-MLLM as embodied planner, with reflection or without (Table III). The paper's prompt is not published. Here a
+model that reflects says after a failure of which of the paper's types it is and what changes, before it plans; half of its
+lessons are so. The log, in which failed steps stand with their codes, is the same without.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from proprio_mllm.model.chat import Encoded
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.observing import EpisodeLog, turn_example
-from proprio_mllm.model.word_tokens import tokens_of
+from proprio_mllm.model.word_tokens import WordTokens, tokens_of
 from proprio_mllm.model.wording import Words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
-from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, check_weights, without_failures
+from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, Usage, check_weights
 
 #: Refusals of a step from one stance after which another one is taken.
 _REFUSALS: Final = 2
@@ -94,7 +94,7 @@ class WordsPlanner:
         motion: the motion tokenizer; needed when the model sees and its answers stand after motion tokens.
         temperature: 0 takes the most likely word.
         insist: whether steps may be taken that are bound to bring nothing (`AnswerGrammar`), or were refused twice.
-        reflection: whether failed steps are in the log.
+        reflection: whether the model says what went wrong after a failure; one that has not learnt to never does.
     """
 
     privileged = False
@@ -108,7 +108,8 @@ class WordsPlanner:
         reflection: bool = True,
     ) -> None:
         self.model, self.motion, self.temperature, self.insist = model, motion, temperature, insist
-        self.reflection = reflection
+        words = tokens_of(model.processor.tokenizer)
+        self.reflection = reflection and (not isinstance(words, WordTokens) or "why" in words.known)
         self.image_size = model.cfg.image_size if model.cfg.sees else 0
         self._tokenizer = model.processor.tokenizer
         self._collator = Collator(model.processor, model.cfg)
@@ -145,7 +146,8 @@ class WordsPlanner:
 
     def begin(self, task: TaskInfo, rng: np.random.Generator) -> WordsState:
         """The state of a new episode."""
-        return WordsState(words=tokens_of(self._tokenizer), generator=torch.Generator().manual_seed(int(rng.integers(2**31))))
+        generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+        return WordsState(words=tokens_of(self._tokenizer), reflects=self.reflection, generator=generator)
 
     def reset(self, task: TaskInfo, rng: np.random.Generator) -> None:
         """Forgets the last episode."""
@@ -172,15 +174,18 @@ class WordsPlanner:
         each_s = (time.perf_counter() - started) / len(answers)
         replies: list[PlannerReply] = []
         for answer in answers:
-            step = answer.step()
-            replies.append(PlannerReply(step.to_text(), step, tokens=answer.read + len(answer.words), latency_s=each_s))
+            step, reflection = answer.step(), answer.reflection
+            text, usage = f"{reflection}\n{step.to_text()}".strip(), Usage(calls=1, reflections=int(bool(reflection)))
+            replies.append(PlannerReply(text, step, "", answer.read + len(answer.words), each_s, usage))
         return replies
 
     def _answer(self, observation: Seen, state: WordsState) -> _Answer:
-        now = state.look(observation if self.reflection else without_failures(observation))
+        now = state.look(observation)
         seen = observation if isinstance(observation, Observation) else None
         turn = turn_example(self.model, state.log, now, seen, self.motion)
-        return _Answer(AnswerGrammar(observation.known_objects, None if self.insist else state.sightings.belief), state, turn)
+        belief = state.sightings.belief
+        reflects = self.reflection and belief.failed is not None
+        return _Answer(AnswerGrammar(observation.known_objects, None if self.insist else belief, reflects), state, turn)
 
     def _write(self, answers: Sequence[_Answer]) -> None:
         """Continues every answer to its end; what has been read of a log before is not read again for an answer alone."""
@@ -301,6 +306,11 @@ class _Answer:
     def step(self) -> PlanStep:
         """The step of a finished answer."""
         return read_step(self.words, self._grammar.ids)
+
+    @property
+    def reflection(self) -> str:
+        """What it says of a failure, empty where it does not."""
+        return " ".join(self.words[: self._grammar.reflected])
 
     def refused(self) -> bool:
         """Whether this step was refused as often as it may be."""

@@ -25,7 +25,7 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.observing import EpisodeLog, pictured_turn
 from proprio_mllm.model.prompts import Style, answers, critic_prompt, self_ask_prompt, with_answer
 from proprio_mllm.model.word_tokens import tokens_of
-from proprio_mllm.model.wording import answer_words
+from proprio_mllm.model.wording import answer_words, reflection_words
 from proprio_mllm.training.goals import Relabel, relabel, verbs_of
 from proprio_mllm.training.judging import LOG_LENGTH
 from proprio_mllm.training.rollouts import Rollout
@@ -226,9 +226,9 @@ def actor_examples(model: ProprioMLLM, kept: Sequence[Kept]) -> list[Example]:
     the next action of an arm that worked.
     """
     examples: list[Example] = []
-    for item in kept:
+    for number, item in enumerate(kept):
         t, rollout = item.trajectory, item.trajectory.rollout
-        log = EpisodeLog(tokens_of(model.processor.tokenizer))
+        log = EpisodeLog(tokens_of(model.processor.tokenizer), reflects=number % 2 == 0)  # as half of the lessons
         for at in range(item.end):
             moment, history = rollout.moments[at], tuple(rollout.history(at))
             now = log.look(Shown(item.goal, rollout.robot, moment.visible, moment.known, history))
@@ -238,7 +238,9 @@ def actor_examples(model: ProprioMLLM, kept: Sequence[Kept]) -> list[Example]:
             thing: str | None = served.object_id or ""
             if thing and thing not in moment.known:
                 thing = None
-            answer = log.words.tokens(answer_words(served.name, thing, PlanStep.parse(moment.step)))
+            step = PlanStep.parse(moment.step)
+            reflection = reflection_words(log.sightings.belief.failed, step) if log.reflects else ()
+            answer = log.words.tokens(answer_words(served.name, thing, step, reflection))
             view = rollout.view(at) if model.cfg.sees else None
             examples.append(pictured_turn(model, log.log, now, view, t.motion[at], answer))
     return examples

@@ -12,6 +12,7 @@ import pytest
 
 from configs.schema.collect import CollectConfig
 from data.shards import ShardReader
+from interface.failures import FailureCode
 from interface.steps import PlanStep
 from proprio_mllm.evaluation import lessons
 from proprio_mllm.evaluation.dagger import collect_lessons
@@ -54,6 +55,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_teacher_answers_logs_as_it_did_in_the_simulator(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lessons, "_RENAMED", 0.0)
+    monkeypatch.setattr(lessons, "_AS_BIT", 0.0)
     episode, reader = Lessons().logged(logs), ShardReader(logs, "demos")
     targets: dict[str, list[str]] = {}
     for name, target in zip(reader.column("episode"), reader.column("target"), strict=True):
@@ -82,6 +84,7 @@ def test_what_was_foreseen_is_the_answer_with_a_picture_and_never_in_words_alone
     ahead: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lessons, "_RENAMED", 0.0)
+    monkeypatch.setattr(lessons, "_AS_BIT", 0.0)
     collect_lessons(CollectConfig("demos", str(tmp_path), 2, seed=3, image_size=28, part_size=10, foreseen=ahead))
     reader = ShardReader(tmp_path, "demos")
     taught = [json.loads(text)["taught"] for text in reader.column("privileged")]
@@ -96,6 +99,33 @@ def test_what_was_foreseen_is_the_answer_with_a_picture_and_never_in_words_alone
 
 def _step(answer: Sequence[str]) -> tuple[str, ...]:
     return tuple(answer[list(answer).index("do") + 1 :])
+
+
+def test_half_of_the_episodes_reflect_on_every_failure() -> None:
+    reflecting = 0
+    for seed in range(40):
+        turns = Lessons().episode(seed).turns
+        failed = [_failed(before.taken) for before in turns[:-1]]
+        asked = ["why" in turn.now[-2:] for turn in turns[1:]]
+        assert asked in (failed, [False] * len(failed))
+        assert ["so" in turn.answer[:2] for turn in turns[1:]] == asked
+        assert turns[0].now[-1] == "do" and "why" not in turns[0].now
+        reflecting += any(asked)
+    assert 10 < reflecting < 30
+
+
+def _failed(taken: Sequence[str]) -> bool:
+    return any(word in {*FailureCode, "fail"} for word in taken)
+
+
+def test_some_episodes_tell_failures_as_one_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    def codes(share: float) -> set[str]:
+        monkeypatch.setattr(lessons, "_AS_BIT", share)
+        taken = {word for seed in range(20) for turn in Lessons().episode(seed).turns for word in turn.taken}
+        return taken & {*FailureCode, "fail"}
+
+    assert codes(1.0) == {"fail"}
+    assert "fail" not in codes(0.0) and len(codes(0.0)) > 5
 
 
 def test_mistakes_are_taken_and_never_learnt(monkeypatch: pytest.MonkeyPatch) -> None:

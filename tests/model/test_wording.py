@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import pytest
 
+from interface.failures import FAILED
 from interface.observation import HistoryItem
 from interface.sightings import Shown, Sightings
 from interface.steps import PlanStep
-from proprio_mllm.model.wording import answer_words, id_words, log_words, prefix_words, read_step, state_words
+from proprio_mllm.model.wording import (
+    MARKERS,
+    answer_words,
+    id_words,
+    log_words,
+    prefix_words,
+    read_step,
+    reflection_words,
+    state_words,
+)
 
 ROOM = ("CounterTop_1", "TVStand_1", "Fridge_2")
 
@@ -66,6 +76,32 @@ def test_hands_and_places() -> None:
         ("Hold(left, Egg_1)", "Hold(left, Egg_1) ok", (), ("Mug_1", "Egg_1")),
     )
     assert " ".join(state_words(placed)) == "now left egg _1 steady right empty away see mug _1 on fridge _2 do"
+
+
+@pytest.mark.parametrize(
+    ("done", "code", "step", "words"),
+    [
+        ("Pick(left, Mug_1)", "BodyTooHigh", "MoveDown(0.2)", "body so height"),
+        ("Pick(left, Mug_1)", "TooFar", "Pick(right, Mug_1)", "navigation so arm"),
+        ("Pick(left, Mug_1)", "TooFar", "GoTo(Mug_1, 0.5)", "navigation so stance"),
+        ("Pick(left, Mug_1)", "ObjectBroken", "GoTo(Fridge_1)", "logical so place"),
+        ("Place(left, Fridge_1)", "ReceptacleClosed", "Open(right, Fridge_1)", "logical so other"),
+        ("Pick(left, Mug_1)", "Slipped", "Pick(left, Mug_1)", "chance so again"),
+        ("Pick(left, Mug_1)", FAILED, "Done()", "chance so end"),
+    ],
+)
+def test_a_failure_is_reflected_on(done: str, code: str, step: str, words: str) -> None:
+    seen = told((done, f"{done} {code}", ("Mug_1",), ("Mug_1",)))
+    assert state_words(seen)[-1] == "do" and "why" not in state_words(seen)
+    assert state_words(seen, reflects=True) == (*state_words(seen)[:-1], "why", "do")
+    assert " ".join(reflection_words(seen.belief.failed, PlanStep.parse(step))) == words
+    assert set(words.split()) <= set(MARKERS)
+
+
+def test_what_works_is_not_reflected_on() -> None:
+    seen = told(("GoTo(Mug_1)", "GoTo(Mug_1) ok", ("Mug_1",), ("Mug_1",)))
+    assert state_words(seen, reflects=True) == state_words(seen)
+    assert reflection_words(seen.belief.failed, PlanStep.parse("Done()")) == ()
 
 
 @pytest.mark.parametrize(

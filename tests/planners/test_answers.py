@@ -39,6 +39,15 @@ def test_every_step_can_be_said_and_is_read_back(text: str) -> None:
     assert read_step(words, grammar.ids) == step
 
 
+def test_a_reflection_comes_first_where_it_is_asked_for() -> None:
+    step, reflecting = PlanStep.parse("MoveDown(0.2)"), AnswerGrammar(IDS, reflects=True)
+    words = answer_words("Pick", "Mug_1", step, ("body", "so", "height"))
+    assert said(words, reflecting) and not said(words, AnswerGrammar(IDS))
+    assert not said(answer_words("Pick", "Mug_1", step), reflecting)
+    assert reflecting.allowed(words) == [] and reflecting.allowed(words[:3]) == AnswerGrammar(IDS).allowed(())
+    assert read_step(words, reflecting.ids) == step
+
+
 @pytest.mark.parametrize(
     "text",
     [

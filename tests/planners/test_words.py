@@ -22,9 +22,9 @@ from proprio_mllm.model.building import build_model, build_processor, save_model
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.observing import turn_example
 from proprio_mllm.model.word_tokens import add_word_tokens
-from proprio_mllm.model.wording import answer_words
+from proprio_mllm.model.wording import CAUSES, CHANGES, answer_words
 from proprio_mllm.planners.answers import AnswerGrammar
-from proprio_mllm.planners.protocol import TaskInfo, WeightsError
+from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, WeightsError
 from proprio_mllm.planners.words import WordsPlanner, _Answer
 from proprio_mllm.training.pipeline import base_model_config
 
@@ -181,20 +181,28 @@ def test_what_has_been_read_is_not_read_again(planner: WordsPlanner) -> None:
         episode.take(reply.step)
 
 
-def test_without_reflection_failed_steps_are_not_in_the_log(planner: WordsPlanner) -> None:
-    shown, blind = WordsOnly(3).shown(), WordsPlanner(planner.model, reflection=False)
+def test_reflection_is_said_and_the_log_is_the_same_without(planner: WordsPlanner) -> None:
+    shown, silent = WordsOnly(3).shown(), WordsPlanner(planner.model, reflection=False)
     lines = ("GoTo(Mug_1) ok", "Pick(left, Mug_1) TooFar", "Pick(right, Mug_1) ok")
     history = tuple(HistoryItem(line.rsplit(" ", 1)[0], line) for line in lines)
-    states = {one: begin(one) for one in (planner, blind)}
+    states = {one: begin(one) for one in (planner, silent)}
+    said: dict[WordsPlanner, list[PlannerReply]] = {planner: [], silent: []}
     for count in range(len(lines) + 1):
         for one, state in states.items():
-            one.step_batch([dataclasses.replace(shown, history=history[:count])], [state])
-    names = {token: word for word, token in states[planner].words.known.items()}  # type: ignore[attr-defined]
-    told = {one: [names.get(token) for token in state.log] for one, state in states.items()}
-    assert told[planner].count("did") == 3
-    assert told[blind].count("did") == 2
-    assert "TooFar" in told[planner] and "TooFar" not in told[blind]
-    assert not states[blind].sightings.belief.fails and states[blind].sightings.belief.state.holds("Mug_1")
+            said[one] += one.step_batch([dataclasses.replace(shown, history=history[:count])], [state])
+    assert states[planner].log == states[silent].log
+    assert [reply.usage.reflections for reply in said[planner]] == [0, 0, 1, 0]
+    assert [reply.usage.reflections for reply in said[silent]] == [0, 0, 0, 0]
+    reflection, _, step = said[planner][2].text.partition("\n")
+    cause, so, change = reflection.split()
+    assert (cause in CAUSES, so, change in CHANGES) == (True, "so", True)
+    assert said[planner][2].step == PlanStep.parse(step)
+    assert said[silent][2].text == said[silent][2].step.to_text()  # type: ignore[union-attr]
+
+
+def test_a_model_that_has_not_learnt_to_reflect_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Lessons, "words", lambda self, words=Lessons.words: tuple(w for w in words(self) if w != "why"))
+    assert not small().reflection
 
 
 def test_temperature_draws_from_the_episodes_generator(planner: WordsPlanner) -> None:
@@ -213,9 +221,9 @@ def test_what_was_refused_twice_is_not_insisted_on(planner: WordsPlanner) -> Non
         state.refused |= refused
         return WordsPlanner(planner.model, insist=insist).step_batch([shown], [state])[0].text
 
-    first = answer({})
+    first, bold = answer({}), answer({}, insist=True)
     assert answer({first: 1}) == first
-    assert answer({first: 2}, insist=True) == first
+    assert answer({bold: 2}, insist=True) == bold
     second = answer({first: 2})
     assert second != first
     assert answer({first: 2, second: 2}) not in (first, second)
