@@ -151,7 +151,7 @@ def _ran_out(result: ScriptedResult) -> bool:
 def _why_left_out(result: ScriptedResult) -> str:
     if result.record.outcome is Outcome.INFRASTRUCTURE_ERROR:
         return "broke"
-    return "the mistake was not made where it matters" if not result.exercised else "the task was solved all the same"
+    return "the mistake was not made where it matters" if not result.mattered else "the task was solved all the same"
 
 
 def _tables(found: Validation, results: Sequence[ScriptedResult]) -> list[Table]:
@@ -214,7 +214,7 @@ def _to_json(config: ValidationConfig, found: Validation, results: Sequence[Scri
             {
                 **dataclasses.asdict(result.episode),
                 "counts": result.counts,
-                "exercised": result.exercised,
+                "mattered": result.mattered,
                 "slipped": result.slipped,
                 "expected": result.expected,
                 "given": result.record.failure,

@@ -2,7 +2,7 @@
 
 The list follows from whatever the benchmark holds and a seed. For every cause and robot (`Cell`) tasks are drawn in a seeded
 order that changes family from task to task; each is acted out by the expert with that fault injected, and counts when it failed
-and the mistake was made where it matters (`FaultyPlanner.exercised`). What does not count gives its place to the next task.
+and the mistake was made where it matters (`FaultyPlanner.mattered`). What does not count gives its place to the next task.
 Neither the order nor that choice looks at the type that the episode was given.
 """
 
@@ -73,21 +73,21 @@ class ScriptedResult:
     Attributes:
         episode: what was asked for.
         record: as in a ledger.
-        exercised: whether the mistake was made where it matters.
+        mattered: whether the mistake was made where it matters.
         slipped: whether there was a passing failure.
         unmet: ids that the goals are about that did not hold at the end.
     """
 
     episode: Scripted
     record: EpisodeRecord
-    exercised: bool
+    mattered: bool
     slipped: bool
     unmet: tuple[str, ...]
 
     @property
     def counts(self) -> bool:
         """Whether it is part of the validation."""
-        return self.exercised and self.record.outcome is Outcome.FAILURE
+        return self.mattered and self.record.outcome is Outcome.FAILURE
 
     @property
     def expected(self) -> FailureCategory:
@@ -166,7 +166,7 @@ def run_scripted(episode: Scripted, task: Task) -> ScriptedResult:
     record = run_episode(open_one, planner, fields, task.instruction, Limits.of(task.time_limit, "task"), own_seed)
     broken = record.outcome is Outcome.INFRASTRUCTURE_ERROR
     unmet = () if broken else tuple(sorted(opened[-1].goals().unmet_objects))
-    return ScriptedResult(episode, record, planner.exercised, planner.slipped, unmet)
+    return ScriptedResult(episode, record, planner.mattered, planner.slipped, unmet)
 
 
 class CellRunner:

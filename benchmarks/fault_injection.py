@@ -11,7 +11,7 @@ A cause belongs to one of the paper's failure types by what the planner does wro
 Until the fault strikes, and where it believes in other goals all along, the planner is the expert. Once it has struck, the
 planner repeats its mistake until the budget is used up or, when it gives up, for a few steps and then says Done.
 
-`exercised` tells whether the mistake was made where it matters: an arm that is farther from its object than it is long, a
+`mattered` tells whether the mistake was made where it matters: an arm that is farther from its object than it is long, a
 height at which the reach test refuses what it allows at another one, mistaken goals that were all met. That decides which
 episodes count in a validation, so it must not look at failure codes or types.
 """
@@ -441,7 +441,7 @@ class FaultyPlanner:
         after: arm actions that succeed before the fault may strike.
 
     Attributes:
-        exercised: whether the mistake was made where it matters.
+        mattered: whether the mistake was made where it matters.
         slipped: whether the slip happened.
     """
 
@@ -459,7 +459,7 @@ class FaultyPlanner:
         self._scripted = 0
         self._acted = 0
         self._believed: tuple[Predicate, ...] | None = None
-        self.exercised = self.slipped = False
+        self.mattered = self.slipped = False
 
     def attach(self, session: Session) -> None:
         """Takes the session of the coming episode."""
@@ -478,7 +478,7 @@ class FaultyPlanner:
         self._rng = rng
         self._script, self._scripted, self._acted = None, 0, 0
         self._believed = None if self._cause.believes is None else self._cause.believes(self._task, rng)
-        self.exercised = self.slipped = False
+        self.mattered = self.slipped = False
 
     def step(self, observation: Observation, feedback: Feedback | None) -> PlannerReply:
         """The expert's step, the slip, or the next step of the mistake."""
@@ -499,15 +499,15 @@ class FaultyPlanner:
                 self._script = self._cause.strikes(now)
             if self._script is None:
                 if self._believed is not None and now.proposed.actions[0].name == "Done":
-                    self.exercised = self._satisfied()
+                    self.mattered = self._satisfied()
                 return parse_reply(now.proposed.to_text())
-            self.exercised = True
+            self.mattered = True
         self._scripted += 1
         if self._gives_up and self._scripted > _PATIENCE:
             return parse_reply("Done()")
         reply = parse_reply(next(self._script))
         if self._cause.category is FailureCategory.NAVIGATION and reply.step is not None:
-            self.exercised = self.exercised and self._is_away(reply.step.actions[0])
+            self.mattered = self.mattered and self._is_away(reply.step.actions[0])
         return reply
 
     def _satisfied(self) -> bool:

@@ -15,14 +15,16 @@ import time
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from interface.bodies import SIDES
 from robots.build_solver import SOLVERS, RobotKit, robot_kit
 from robots.kinematics import root_quaternion
-from robots.reach import reach_over_heights
 from robots.self_collision import SELF_TOUCH_M
 from robots.solver import ArmSolver, IkResult, ReachTarget, rotation_from_axes
 from robots.spec import available_robots
+
+Array = NDArray[np.float64]
 
 #: The grid: shares of the arm's reach ahead of the pelvis, metres left of it (right for the right arm), shares of the reach
 #: above the shoulder.
@@ -175,6 +177,17 @@ def run_sampled(kit: RobotKit, count: int, arms: tuple[str, ...], mode: str, rng
     return summary(results, seconds)
 
 
+def reached(kit: RobotKit, arm: str, point_in_base: Array, rotation: Array | None = None, heights: int = 5) -> list[bool]:
+    """Whether an arm gets to a point (3,), metres ahead of and left of the pelvis and above the floor, from the pelvis heights
+    of the robot's range, ascending."""
+    found = []
+    for height in np.linspace(*kit.spec.pelvis_height_range_m, heights):
+        target = ReachTarget(point_in_base - np.array([0.0, 0.0, height]), rotation)
+        start = kit.crouches.at(float(height)).q
+        found.append(kit.solver.solve({arm: target}, start, pelvis_height_m=float(height), restarts=1).success)
+    return found
+
+
 def run_table(kit: RobotKit) -> dict[str, object]:
     """Left arm over tables: per table height, the fraction of points reached standing and at some pelvis height."""
     rotation = rotation_from_axes(np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0]))
@@ -184,11 +197,11 @@ def run_table(kit: RobotKit) -> dict[str, object]:
         for x in np.arange(0.25, 0.61, 0.07):
             for y in (0.0, 0.15, 0.3):
                 begin = time.perf_counter()
-                reach = reach_over_heights(kit, "left", np.array([x, y, table_m + 0.06]), rotation)
-                seconds.append((time.perf_counter() - begin) / len(reach.heights_m))
+                there = reached(kit, "left", np.array([x, y, table_m + 0.06]), rotation)
+                seconds.append((time.perf_counter() - begin) / len(there))
                 total += 1
-                standing += bool(reach.reached[-1])
-                anywhere += bool(reach.reached.any())
+                standing += there[-1]
+                anywhere += any(there)
         rows[f"table {table_m:.1f} m"] = {"standing": standing / total, "at some height": anywhere / total}
     return {"reach": rows, "ms_median": 1e3 * float(np.median(seconds)), "ms_p95": 1e3 * float(np.percentile(seconds, 95))}
 

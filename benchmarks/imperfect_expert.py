@@ -4,8 +4,8 @@
 
 It finds the task by the instruction in the prompt and answers in whatever form the planner asks for. Asked to plan, it goes
 on with the certified plan as if every step had worked, and makes a mistake in a share `MISTAKES` of its steps (environment
-variable of that name; wrong arm, wrong height, too far, malformed). Asked to reflect, it reads the log: it does again what bad
-luck spoiled, undoes its mistakes and goes on from there. What a planner reaches with it says whether the planner's retrieval,
+variable of that name; wrong arm, wrong height, too far, malformed). Asked to reflect, it reads the log: it does again what
+chance spoiled, undoes its mistakes and goes on from there. What a planner reaches with it says whether the planner's retrieval,
 scheduling and reflection work; it is no result, and no table of results shows it.
 """
 
@@ -28,7 +28,7 @@ from sim.tasks.task import load_benchmark
 
 MISTAKES = float(os.environ.get("MISTAKES", "0.2"))
 KINDS = ("wrong arm", "wrong height", "too far", "malformed")
-BAD_LUCK = ("Slipped", "Spilled", "NothingHappened", "Locked")
+BY_CHANCE = ("Slipped", "Spilled", "NothingHappened", "Locked")
 OCCUPIES, RELEASES, TOOLS = ("Pick", "Lift", "Hold"), ("Place", "PlaceBoth", "Release"), ("Slice", "Clean", "Pour", "Fill")
 
 
@@ -85,7 +85,7 @@ def swapped(step: str) -> str:
 
 
 def left_over(plan: Sequence[str], log: Sequence[str]) -> list[str]:
-    """What of a plan is still to do after a log: bad luck is met again, a plan done with the other arm is gone on with."""
+    """What of a plan is still to do after a log, also one done with the other arm; what chance spoiled is done again."""
     place, other = 0, False
     for line in log:
         if place == len(plan):
@@ -95,7 +95,7 @@ def left_over(plan: Sequence[str], log: Sequence[str]) -> list[str]:
         done = " & ".join(results)
         if done == swapped(wanted) != wanted and set(results.values()) == {"ok"}:
             place, other = place + 1, not other
-        elif done == wanted and not set(results.values()) & set(BAD_LUCK):
+        elif done == wanted and not set(results.values()) & set(BY_CHANCE):
             place += 1
     rest = [swapped(step) for step in plan[place:]] if other else list(plan[place:])
     return rest or ["Done()"]
@@ -113,7 +113,7 @@ def _plan(task: str, plan: Sequence[str], log: Sequence[str]) -> dict[str, objec
 
 
 def _reflection(task: str, plan: Sequence[str], log: Sequence[str]) -> dict[str, object]:
-    return {"cause": "bad luck or a slip of mine", "change": "do it as planned", "steps": left_over(plan, log)}
+    return {"cause": "chance or a slip of mine", "change": "do it as planned", "steps": left_over(plan, log)}
 
 
 def _outline(task: str, plan: Sequence[str], log: Sequence[str]) -> dict[str, object]:
@@ -166,7 +166,7 @@ def _graph(task: str, plan: Sequence[str], log: Sequence[str]) -> dict[str, obje
 def _revised(task: str, plan: Sequence[str], log: Sequence[str]) -> dict[str, object]:
     done = [Action.parse(text) for line in log for text in re.findall(r"(\w+\([^()]*\)) ok", line)]
     rest = nodes(plan, [(action.name, action.object_id) for action in done])
-    return {"cause": "bad luck", "change": "do it again", "nodes": rest}
+    return {"cause": "chance", "change": "do it again", "nodes": rest}
 
 
 FORMS: Mapping[str, Callable[[str, Sequence[str], Sequence[str]], dict[str, object] | str]] = {

@@ -1,7 +1,7 @@
 """Why an action failed: one code per reason, the paper's failure type it rolls up to, and the margins that explain it.
 
 A failed action returns exactly one code. Every code belongs to one of the paper's three failure types (Table IV: navigation,
-body adjustment, logical). Codes of a contingency (bad luck that the seed decided) take the type of what the action was about:
+body adjustment, logical). Codes of a contingency (chance, as the seed decides) take the type of what the action was about:
 a body movement is navigation, a change of body height is body adjustment, everything else is logical, because what remains for
 the planner is to notice and recover.
 
@@ -208,12 +208,12 @@ FAILURES: Final[Mapping[FailureCode, FailureSpec]] = {
     ),
     FailureCode.OBJECT_BROKEN: FailureSpec(_LOGIC, "the object is broken", "the object is broken"),
     FailureCode.SLIPPED: FailureSpec(
-        None, "contingency: the object slipped out of the hand", "bad luck: the object slipped out of the hand, try again"
+        None, "contingency: the object slipped out of the hand", "by chance: the object slipped out of the hand, try again"
     ),
-    FailureCode.BROKE: FailureSpec(None, "contingency: the object fell and broke", "bad luck: the object fell and broke"),
-    FailureCode.SPILLED: FailureSpec(None, "contingency: the liquid was spilled", "bad luck: the liquid was spilled"),
-    FailureCode.NOTHING_HAPPENED: FailureSpec(None, "contingency: the action had no effect", "bad luck: no effect, try again"),
+    FailureCode.BROKE: FailureSpec(None, "contingency: the object fell and broke", "by chance: the object fell and broke"),
+    FailureCode.SPILLED: FailureSpec(None, "contingency: the liquid was spilled", "by chance: the liquid was spilled"),
+    FailureCode.NOTHING_HAPPENED: FailureSpec(None, "contingency: the action had no effect", "by chance: no effect, try again"),
     FailureCode.LOCKED: FailureSpec(
-        None, "contingency: the door or drawer is stuck for the moment", "bad luck: stuck for the moment, try again"
+        None, "contingency: the door or drawer is stuck for the moment", "by chance: stuck for the moment, try again"
     ),
 }

@@ -1,4 +1,4 @@
-"""Every text the model reads or writes besides its episodes: grounding, motion exercises, judging.
+"""Every text the model reads or writes besides its episodes: grounding, questions about motion, judging.
 
 Two styles with the same content: `full` sentences for models that read English, and `terse` for models that learn the format
 from scratch, where every token costs time. In terse lists object ids follow one another without separators (`Mug_1Cup_2`): an

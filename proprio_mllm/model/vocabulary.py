@@ -1,7 +1,7 @@
 """Motion tokens in the language model's vocabulary (paper: motion tokenizer, "the vocabulary is extended").
 
 A code k of the motion codebook is the token `<motion_k>`; a window is written between `<motion_start>` and `<motion_end>`;
-`<motion_mask>` hides a code in masked-motion exercises. The tokens are ordinary added tokens, not special ones: special ones
+`<motion_mask>` hides a code in masked motion. The tokens are ordinary added tokens, not special ones: special ones
 would vanish from decoded text.
 """
 

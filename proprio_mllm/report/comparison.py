@@ -31,7 +31,7 @@ _FIGURES: Final[Mapping[str, Callable[[EpisodeRecord], float]]] = {
     "goal_conditions": lambda record: record.goal_conditions_met,
     "steps": lambda record: float(record.steps),
 }
-_SAME_LUCK: Final = ("robot", "difficulty", "start", "steps", "seed", "contingencies")
+_SAME_DRAWS: Final = ("robot", "difficulty", "start", "steps", "seed", "contingencies")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ def compare_runs(a: Run, b: Run) -> RunComparison:
     """
     differing = [
         f"{name}: {a.metadata[name]!r} and {b.metadata[name]!r}"
-        for name in _SAME_LUCK
+        for name in _SAME_DRAWS
         if a.metadata.get(name) != b.metadata.get(name)
     ]
     hashes = [run.metadata.get("contingencies_hash") for run in (a, b)]

@@ -148,7 +148,7 @@
 
   const costs = (e) => [
     ["steps", e.time_limit === null ? e.steps : `${e.steps - e.struck}, in time ${e.time_limit}`],
-    ...(e.struck ? [["struck by bad luck, not charged", e.struck]] : []),
+    ...(e.struck ? [["spoiled by a contingency, not charged", e.struck]] : []),
     ["goals met", `${Math.round(100 * e.goal_conditions_met)} %`],
     ["makespan", `${fixed(e.makespan_s, 1)} s`],
     ["path", `${fixed(e.path_length_m, 2)} m`],

@@ -1,4 +1,4 @@
-"""Judging exercises from the logs of lessons: was the goal completed, and which objects are in a state.
+"""Judging questions from the logs of lessons: was the goal completed, and which objects are in a state.
 
 A released model can answer such questions; the tiny one has to learn it. The answers come from what the log itself says (an
 action with `ok`, or the end of a successful episode), never from privileged simulator state, so a judge learns to

@@ -29,7 +29,7 @@ _STARTS_M: Final = (0.0, -0.05, -0.1, -0.2, -0.3)
 _LOWEST_M: Final = (-0.25, -0.35, -0.5)
 _HIGHEST_M: Final = 0.0
 #: What physics says to an action that was right, with a probability: once, or every time from the same stance.
-_BAD_LUCK: Final = 0.02
+_BY_CHANCE: Final = 0.02
 _AWKWARD: Final = 0.08
 #: How often what one has walked to is still out of reach: arms that are solved apart from the waist do not lean. Some things
 #: lie so that it is nearly always: how many of them, and how often then. These and the next figures were measured with the
@@ -204,7 +204,7 @@ class TextWorld:
             return FailureCode.BODY_TOO_LOW if misfit > 0 else FailureCode.BODY_TOO_HIGH
         if action in self._awkward:
             return self._awkward[action]
-        if self._rng.random() < _BAD_LUCK and FailureCode.NOTHING_HAPPENED in action.spec.meets:
+        if self._rng.random() < _BY_CHANCE and FailureCode.NOTHING_HAPPENED in action.spec.meets:
             return FailureCode.NOTHING_HAPPENED
         codes = [code for code in _MISHAPS if code in action.spec.meets]
         if codes and self._rng.random() < _AWKWARD:

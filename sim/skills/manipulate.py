@@ -262,7 +262,7 @@ def pick(body: Body, action: Action, outcome_draw: OutcomeDraw) -> Skill:
     body.world.grasps.attach(arm.value, obj.object_id)
     yield from _lift(body, arm)
     if outcome != "success":
-        yield from _bad_luck(body, arm, obj, outcome)
+        yield from _contingency(body, arm, obj, outcome)
     yield from stow(body, arm, name)
     if body.hands.held[arm] != obj.object_id:
         raise SkillFailure(FailureCode.DROPPED)
@@ -287,7 +287,7 @@ def _lift(body: Body, arm: Arm) -> Skill:
         yield from body.arms.move(arm, [up.q])
 
 
-def _bad_luck(body: Body, arm: Arm, obj: ObjectInstance, outcome: str) -> Skill:
+def _contingency(body: Body, arm: Arm, obj: ObjectInstance, outcome: str) -> Skill:
     """Executes a contingency of Pick: the object leaves the hand, and may break or spill."""
     codes = {"slipped": FailureCode.SLIPPED, "spilled": FailureCode.SPILLED, "broken": FailureCode.BROKE}
     code = codes.get(outcome, FailureCode.NOTHING_HAPPENED)

@@ -1,1 +1,1 @@
-"""Command-line tools that draw, film and exercise the simulator."""
+"""Command-line tools that draw, film and try the simulator."""

@@ -21,7 +21,7 @@ def result(
     given: FailureCategory | None,
     *,
     robot: str = "h1",
-    exercised: bool = True,
+    mattered: bool = True,
     invalid: int = 0,
     done: bool = False,
     exhausted: bool | None = None,
@@ -55,7 +55,7 @@ def result(
         1,
         trace,
     )
-    return ScriptedResult(episode, record, exercised, slip is not None, ())
+    return ScriptedResult(episode, record, mattered, slip is not None, ())
 
 
 GOOD = [
@@ -68,7 +68,7 @@ GOOD = [
 
 def test_counts() -> None:
     found = validate(
-        [*GOOD, result("crouches", NAVIGATION), result("one hand", None), result("one hand", LOGICAL, exercised=False)]
+        [*GOOD, result("crouches", NAVIGATION), result("one hand", None), result("one hand", LOGICAL, mattered=False)]
     )
     assert (found.agreed, found.episodes) == (4, 5)
     assert found.matrix[BODY, NAVIGATION] == 1 and found.matrix[LOGICAL, LOGICAL] == 2

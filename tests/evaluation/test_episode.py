@@ -100,7 +100,7 @@ def test_what_only_repeats_itself_is_ended_as_stuck(session, scripted, fields) -
     assert unlucky.outcome is Outcome.SUCCESS
 
 
-def test_steps_that_bad_luck_spoils_are_not_charged(session, scripted, fields) -> None:
+def test_steps_that_chance_spoils_are_not_charged(session, scripted, fields) -> None:
     plan = (*SOLVED[:2], *["Pick(left, Mug_1)"] * 9)
     planner = scripted(*plan)
     record = play(session(unlucky=4), planner, fields, budget=3)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from benchmarks.ik import reached
 from configs.validate import ConfigError
 from interface.bodies import SIDES
 from robots.build_solver import SOLVERS, robot_kit
 from robots.kinematics import root_quaternion
-from robots.reach import reach_over_heights
 from robots.solver import ReachTarget, rotation_from_axes
 from robots.spec import available_robots, load_robot
 
@@ -160,17 +160,13 @@ def test_rotation_from_axes_is_a_rotation():
 
 
 @pytest.mark.parametrize("name", available_robots())
-def test_reach_over_heights(name):
+def test_what_is_reached_depends_on_the_pelvis_height(name):
     kit = robot_kit(name)
-    low, high = kit.spec.pelvis_height_range_m
-    far = reach_over_heights(kit, "left", np.array([2.0, 0.2, 0.8]))
-    assert not far.reached.any() and far.shortfall_m.min() > 0.9
-    z_m = {"h1": 0.5, "x1": 0.42}[name]
-    deep = reach_over_heights(kit, "right", np.array([0.3, -0.2, z_m]))
-    assert deep.reached[0] and not deep.reached[-1]
-    easy = reach_over_heights(kit, "left", np.array([0.3, 0.2, high]))
-    assert easy.reached[-1]
-    assert far.heights_m[0] == low
+    high = kit.spec.pelvis_height_range_m[1]
+    assert not any(reached(kit, "left", np.array([2.0, 0.2, 0.8])))
+    deep = reached(kit, "right", np.array([0.3, -0.2, {"h1": 0.5, "x1": 0.42}[name]]))
+    assert deep[0] and not deep[-1]
+    assert reached(kit, "left", np.array([0.3, 0.2, high]))[-1]
 
 
 def test_one_kit_per_description(tmp_path):

@@ -1,4 +1,4 @@
-"""Judging exercises, and how a critic's verdicts become examples; the critic here is a scripted one."""
+"""Judging questions, and how a critic's verdicts become examples; the critic here is a scripted one."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from proprio_mllm.planners.protocol import succeeded
 
 REFLECTION_RULES = (
     "The last step failed. Think about why: name the cause, say what has to change, then give the next steps from here. "
-    "Do not repeat what has just failed unless bad luck was the cause or you change what made it fail.\n"
+    "Do not repeat what has just failed unless chance was the cause or you change what made it fail.\n"
     'Reply with one JSON object: {"cause": "...", "change": "...", "steps": ["...", ...]}'
 )
 

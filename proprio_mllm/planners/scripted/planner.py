@@ -42,7 +42,7 @@ _ASIDE_NAMES: Final = ("MoveBack", "MoveRight", "MoveLeft")
 #: Failures of one action after which it is given up.
 _PATIENCE: Final = 16
 #: Codes after which the same thing may work when it is tried again.
-_BAD_LUCK: Final = (FailureCode.NOTHING_HAPPENED, FailureCode.LOCKED, FailureCode.SLIPPED, FailureCode.SPILLED)
+_BY_CHANCE: Final = (FailureCode.NOTHING_HAPPENED, FailureCode.LOCKED, FailureCode.SLIPPED, FailureCode.SPILLED)
 #: Codes that a better knowledge of the world answers: what comes next is another job.
 _KNOWLEDGE: Final = (
     FailureCode.ALREADY_IN_STATE,
@@ -179,7 +179,7 @@ class ScriptedPlanner:
             return self._walk(job, belief, failed=bool(failed))
         if last.code in _HEIGHT:
             return self._height(job, belief, up=last.code == FailureCode.BODY_TOO_LOW)
-        if last.code in _BAD_LUCK and len(failed) % 3:
+        if last.code in _BY_CHANCE and len(failed) % 3:
             return None
         if last.code in _KNOWLEDGE:
             return self._walk(job, belief, failed=False)
@@ -253,6 +253,6 @@ class ScriptedPlanner:
         if belief.let_shut.get(job.target or "", 0) % 2:
             side = side.other
         last = next((event for event in belief.last if event.about(job.verb, job.target)), None)
-        if last is not None and not last.ok and last.action.arm is not None and last.code not in _BAD_LUCK:
+        if last is not None and not last.ok and last.action.arm is not None and last.code not in _BY_CHANCE:
             side = last.action.arm.other
         return side if side in free else free[0]

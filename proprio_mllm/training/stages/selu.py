@@ -2,9 +2,9 @@
 
 Actor and critic are two LoRA adapters over the stage-2 model: the actor goes on with stage 2's adapter, the critic starts as
 its copy. A round: roll the actor out with a temperature, judge every end, ask oneself and relabel failures keeping the verb,
-fine-tune the critic, judge again, fine-tune the actor on the kept trajectories. Before the first round the critic practises on
+fine-tune the critic, judge again, fine-tune the actor on the kept trajectories. Before the first round the critic learns from
 questions about the expert's logs and about episodes in words. The critic's agreement with the simulator is reported and, unless
-`truth=oracle`, never used. Part of each batch is replayed against forgetting: demonstrations, and exercises in words in the
+`truth=oracle`, never used. Part of each batch is replayed against forgetting: demonstrations, and episodes in words in the
 proportion of stage 2; the abstract of SELU mentions no replay.
 """
 

@@ -38,9 +38,9 @@ def test_draws_depend_on_the_key_only():
 
 
 def test_luck_of_two_objects_and_of_two_actions_is_not_the_same():
-    luck = Contingency(CONFIG, "medium", 7)
+    contingency = Contingency(CONFIG, "medium", 7)
     drawn = {
-        (action, name): [luck.draw(step, action, name, "Mug", {}) == "success" for step in range(200)]
+        (action, name): [contingency.draw(step, action, name, "Mug", {}) == "success" for step in range(200)]
         for action in ("Pick", "Place")
         for name in ("Mug_1", "Mug_2")
     }

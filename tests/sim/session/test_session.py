@@ -143,7 +143,7 @@ def test_luck_is_keyed_by_the_seed():
     made.close()
 
 
-def test_the_budget_charges_no_step_that_bad_luck_spoils():
+def test_the_budget_charges_no_step_that_chance_spoils():
     made = Session("h1", "hard", 0, step_limit=2)
     made.reset(TASK, 3)
     steps(made, "GoTo(Mug_1)")

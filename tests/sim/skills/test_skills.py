@@ -295,7 +295,7 @@ def test_a_load_that_is_carried_low_comes_up_before_the_desk(robot):
     made.close()
 
 
-def test_bad_luck_is_acted_out():
+def test_contingencies_are_acted_out():
     made = Session("h1", "hard", 0)
     start(made)
     act(made, "GoTo(Mug_1)")

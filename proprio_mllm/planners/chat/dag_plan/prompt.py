@@ -50,7 +50,7 @@ GRAPH_FORM: Final = f'Reply with one JSON object: {{"reasoning": "...", "nodes":
 REVISED_FORM: Final = (
     "The last step failed. Think about why: name the cause, say what has to change, then give a new graph for all that is "
     "still to be done from here. What is done is not part of it, and what the hands hold already has no occupy. Do not repeat "
-    "what has just failed unless bad luck was the cause or you change what made it fail.\n"
+    "what has just failed unless chance was the cause or you change what made it fail.\n"
     f'Reply with one JSON object: {{"cause": "...", "change": "...", "nodes": [{_NODE}, ...]}}'
 )
 
