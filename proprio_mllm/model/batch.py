@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from configs.schema.model import ModelConfig
 from interface.observation import Camera
@@ -111,6 +112,21 @@ class ImageBatch(Movable):
 
 
 @dataclass(frozen=True, slots=True)
+class Logs(Movable):
+    """What the rows of a batch go on from: E logs, each with as many rows N (`proprio_mllm.model.branches`).
+
+    Attributes:
+        ids: (E, M) tokens.
+        kept: (E, M) those that are no padding.
+        read: (E, N) how many of them each row follows.
+    """
+
+    ids: Tensor
+    kept: Tensor
+    read: Tensor
+
+
+@dataclass(frozen=True, slots=True)
 class Batch(Movable):
     """Model inputs.
 
@@ -121,6 +137,7 @@ class Batch(Movable):
         labels: (B, S), -100 where nothing is learnt.
         images: the images of all rows in order, or None.
         out_of: supervised tokens of the whole batch of which it is a part, 0 where it is one by itself.
+        logs: what stands before the rows, in the order of the rows; None where each row is all there is.
     """
 
     input_ids: Tensor
@@ -129,6 +146,7 @@ class Batch(Movable):
     labels: Tensor
     images: ImageBatch | None = None
     out_of: int = 0
+    logs: Logs | None = None
 
     def then(self, tokens: Tensor) -> Batch:
         """More text (B, K) after each left-padded row, where a cache holds the rows."""
@@ -209,6 +227,27 @@ class Collator:
         whole = sum(part.supervised for part in parts)
         return tuple(replace(part, out_of=whole) for part in parts)
 
+    def beside(self, logs: Sequence[Sequence[int]], rows: Sequence[Sequence[Example]]) -> Batch:
+        """A batch of rows that go on from a log, so that every log is read once.
+
+        Args:
+            logs: tokens of each log.
+            rows: of each log as many; their `start` tells how much of it they follow.
+        """
+        batch = self([example for of_log in rows for example in of_log], padding="right")
+        pad, length = int(self.tokenizer.pad_token_id), _bucket(max(map(len, logs)), 64)
+        extra = _bucket(batch.input_ids.shape[1], 16) - batch.input_ids.shape[1]
+        told = [functional.pad(torch.tensor(list(log)), (0, length - len(log)), value=pad) for log in logs]
+        kept = torch.arange(length) < torch.tensor([len(log) for log in logs])[:, None]
+        return replace(
+            batch,
+            input_ids=functional.pad(batch.input_ids, (0, extra), value=pad),
+            attention_mask=functional.pad(batch.attention_mask, (0, extra)),
+            position_ids=functional.pad(batch.position_ids, (0, extra)),
+            labels=functional.pad(batch.labels, (0, extra), value=IGNORE),
+            logs=Logs(torch.stack(told), kept, torch.tensor([[example.start for example in of_log] for of_log in rows])),
+        )
+
     def __call__(
         self, examples: Sequence[Example], generation: bool = False, padding: Literal["left", "right"] | None = None
     ) -> Batch:
@@ -280,3 +319,8 @@ class Collator:
             labels[row, span] = torch.tensor(targets)
             positions[:, row, span] = place
         return Batch(input_ids, mask, positions, labels, images)
+
+
+def _bucket(size: int, step: int) -> int:
+    """A size rounded up: kernels are prepared anew for every shape."""
+    return -(-size // step) * step

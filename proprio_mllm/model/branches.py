@@ -156,26 +156,28 @@ def _split(rows: Tensor, m: int, n: int) -> tuple[Tensor, Tensor]:
     return own, rows[:, None, :, :m].expand(-1, n, -1, -1, -1).flatten(0, 1)
 
 
-def read_branches(text_model: Any, input_ids: Tensor, position_ids: Tensor, layout: Branches, kept: Tensor) -> Tensor:
+def read_branches(model: Any, input_ids: Tensor, position_ids: Tensor, layout: Branches, kept: Tensor, **inputs: Any) -> Tensor:
     """Last hidden states of rows with branches.
 
     Args:
-        text_model: a language model of Transformers.
+        model: a language model of Transformers, or one that sees with a language model in it.
         input_ids: (B, S).
-        position_ids: (B, S).
+        position_ids: (B, S), or (3, B, S).
         layout: where the branches are.
         kept: (B, S) tokens that are no padding; of each log and each branch, the first ones.
+        inputs: what else the model takes.
 
     Returns:
         (B, S, hidden); what it holds of padding means nothing.
     """
     line = _Line.of(layout, kept)
-    with _own_attention(text_model):
-        hidden = text_model(
+    with _own_attention(getattr(model, "language_model", model)):
+        hidden = model(
             input_ids=input_ids.flatten()[line.slots][None],
             attention_mask={"full_attention": line},
-            position_ids=position_ids.flatten()[line.slots][None],
+            position_ids=position_ids.flatten(-2)[..., line.slots].unsqueeze(-2),
             use_cache=False,
+            **inputs,
         )[0]
     return line.rows(hidden[0])
 

@@ -9,7 +9,7 @@ Shape letters: B batch, S sequence, I images, N visual tokens per image, D hidde
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ from transformers.modeling_outputs import BaseModelOutputWithPooling
 
 from configs.schema.model import ModelConfig
 from proprio_mllm.model.batch import IGNORE, Batch, ImageBatch
+from proprio_mllm.model.branches import Branches, read_branches
 from proprio_mllm.model.cse import CrossSpatialEncoder
 from proprio_mllm.model.mpe import SignEmbedding
 from proprio_mllm.model.processor import ProprioProcessor
@@ -171,7 +172,7 @@ class ProprioMLLM(nn.Module):
         if bool((batch.attention_mask.diff(dim=1) <= 0).all()):
             # Padding stands right of every token, where causal attention never looks: no mask, and the fast kernel.
             inputs["attention_mask"] = None
-        hidden = self.core.model(**inputs, use_cache=False)[0]  # (B, S, D)
+        hidden = self._beside(batch, inputs) if batch.logs else self.core.model(**inputs, use_cache=False)[0]  # (B, S, D)
         # Logits are computed where something is learnt only: V is large, targets are few.
         target = batch.labels[:, 1:]
         chosen = target != IGNORE
@@ -182,6 +183,24 @@ class ProprioMLLM(nn.Module):
         correct = int((logits.detach().argmax(-1) == picked).sum()) if count else 0
         everything = self.core.lm_head(hidden) if return_logits else None
         return ModelOutput(loss, count, correct, visual, everything)
+
+    def _beside(self, batch: Batch, inputs: Mapping[str, Any]) -> Tensor:
+        """Last hidden states (B, S, D) of rows that go on from logs."""
+        assert batch.logs is not None
+        (logs, size), turns = batch.logs.ids.shape, batch.logs.read.shape[1]
+
+        def joined(before: Tensor, rows: Tensor) -> Tensor:  # (E, M) and (E * N, S) to (E, M + N * S)
+            return torch.cat([before, rows.unflatten(-2, (logs, turns)).flatten(-2)], -1)
+
+        hidden = read_branches(
+            self.core.model,
+            joined(batch.logs.ids, batch.input_ids),
+            joined(torch.arange(size, device=self.device).expand(3, logs, size), batch.position_ids),
+            Branches(size, batch.logs.read),
+            joined(batch.logs.kept, batch.attention_mask > 0),
+            **({"mm_encoder_outputs": inputs["mm_encoder_outputs"]} if batch.images is not None else {}),
+        )
+        return hidden[:, size:].unflatten(1, (turns, -1)).flatten(0, 1)
 
     @torch.no_grad()
     def following(self, batch: Batch, cache: Cache) -> Tensor:

@@ -41,7 +41,7 @@ from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordBatch, WordsObjective
 
-Kind = Literal["say", "feel", "do", "fill", "say_image", "body", "plan", "text"]
+Kind = Literal["say", "feel", "do", "fill", "say_image", "body", "plan", "judge", "text"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,11 +94,13 @@ class AlignmentData:
         """A batch of one kind from the training rows, in parts."""
         if kind == "text":
             return self.words.batch(rng, max(1, size // EPISODE_ROWS))
+        if kind == "plan":
+            return Parts((kind, part) for part in self.turns.batch(rng, max(1, size // EPISODE_ROWS)))
         return Parts((kind, part) for part in self._collator.in_parts(self._examples(kind, rng, size)))
 
     def _examples(self, kind: Kind, rng: np.random.Generator, size: int) -> list[Example]:
-        if kind == "plan":
-            return [self._plan(int(i), rng) for i in self.demos.draw(rng, size)]
+        if kind == "judge":
+            return [judge_example(self.demos, int(i), rng, self.turns.codes) for i in self.demos.draw(rng, size)]
         if kind == "body":
             return [self._body(int(i), rng) for i in rng.choice(self.views.split.train, size)]
         if kind == "feel":
@@ -109,11 +111,6 @@ class AlignmentData:
         rows = rng.choice(self.clips.split.train, size)
         codes = self._encode(np.stack([self.clips.window(int(i), frames, rng) for i in rows]))
         return [self._motion_text(kind, int(i), code, rng) for i, code in zip(rows, codes, strict=True)]
-
-    def _plan(self, index: int, rng: np.random.Generator) -> Example:
-        if rng.random() < self._cfg.judge_share:
-            return judge_example(self.demos, index, rng, self.turns.codes)
-        return self.turns.draw(rng, 1)[0]
 
     def _motion_text(self, kind: Kind, clip: int, codes: Sequence[int], rng: np.random.Generator) -> Example:
         caption = self.clips.caption(clip, rng)
@@ -190,7 +187,9 @@ class AlignmentObjective(Objective):
         """Drawn anew each step."""
         others: tuple[Kind, ...] = tuple(kind for kind in self._kinds if kind != "plan")
         if "plan" in self._kinds and rng.random() < self._cfg.plan_share:
-            return "text" if rng.random() < self._cfg.text_share else "plan"
+            if rng.random() < self._cfg.text_share:
+                return "text"
+            return "judge" if rng.random() < self._cfg.judge_share else "plan"
         return others[int(rng.integers(len(others)))]
 
     def batch(self, rng: np.random.Generator, size: int, kind: Kind) -> Parts:

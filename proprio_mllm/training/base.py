@@ -29,7 +29,7 @@ from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordBatch, WordsObjective
 
-#: Decisions that take as long as an episode in words.
+#: Views that take as long as an episode, in words or with pictures.
 EPISODE_ROWS: Final = 4
 #: Share of phrases among the judging questions.
 PHRASES: Final = 0.1
@@ -163,14 +163,12 @@ class JointObjective(_Base):
         if kind == "words":
             return self._words.batch(rng, max(1, size // EPISODE_ROWS))
         if kind == "plan":
-            return self._parts(kind, self._turns.draw(rng, size))
+            parts = self._turns.batch(rng, max(1, size // EPISODE_ROWS))
+            return Parts(_JointBatch(kind, part, None, None, 0.0) for part in parts)
         examples = [
             phrase(self._clips, rng, self._demos.style) if rng.random() < PHRASES else judge_example(self._demos, i, rng, None)
             for i in self._demos.draw(rng, size)
         ]
-        return self._parts(kind, examples)
-
-    def _parts(self, kind: Literal["plan", "judge"], examples: Sequence[Example]) -> Parts:
         return Parts(_JointBatch(kind, part, None, None, 0.0) for part in self._collator.in_parts(examples))
 
     def weight(self, batch: _JointBatch | Parts) -> float:

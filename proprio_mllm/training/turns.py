@@ -2,19 +2,22 @@
 
 A row of `demos` shards is the moment before a step. The teacher's answer to it, and the words of its log, come from the same
 source as in stage `words`; its picture and its motion stand before the answer, as they do at run time
-(`proprio_mllm.model.observing`). Every row reads its log anew: beside 16 visual tokens that is little.
+(`proprio_mllm.model.observing`). A batch holds several decisions of each of its episodes, so that a log is read once for all of
+them (`Collator.beside`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from proprio_mllm.model.batch import Collator, Example
+from proprio_mllm.model.batch import Batch, Collator, Example
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.observing import pictured_turn
@@ -22,6 +25,10 @@ from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.sources import Demos
 from proprio_mllm.training.words import LONGEST_LOG
+
+#: Decisions of an episode in a batch, and episodes that are computed together.
+TURNS: Final = 6
+_EPISODES: Final = 4
 
 
 class Turns:
@@ -63,16 +70,33 @@ class Turns:
                 log += words.tokens(turn.taken)
         rows = np.array(sorted(self._told), dtype=np.int64)
         self.train, self.test = np.intersect1d(rows, demos.split.train), np.intersect1d(rows, demos.split.test)
+        self._collator = Collator(model.processor, model.cfg)
+        #: Training rows of each episode.
+        ends = np.searchsorted(self.train, [*starts[1:], len(names)])
+        self._episodes = [rows for rows in np.split(self.train, ends[:-1]) if len(rows)]
 
     def draw(self, rng: np.random.Generator, size: int) -> list[Example]:
         """Training decisions."""
         return [self.example(int(row)) for row in rng.choice(self.train, size)]
 
-    def example(self, row: int) -> Example:
-        """The decision of a row."""
+    def batch(self, rng: np.random.Generator, episodes: int) -> tuple[Batch, ...]:
+        """Training decisions of some episodes, longer ones more often, in parts of similar length."""
+        shares = np.array([len(rows) for rows in self._episodes])
+        chosen = rng.choice(len(self._episodes), episodes, p=shares / shares.sum())
+        drawn = [np.sort(rng.choice(self._episodes[i], TURNS, replace=shares[i] < TURNS)) for i in chosen]
+        drawn.sort(key=lambda rows: len(self._told[rows[-1]][0]))
+        parts: list[Batch] = []
+        for some in (drawn[first : first + _EPISODES] for first in range(0, episodes, _EPISODES)):
+            rows = [[self.example(int(row), len(self._told[row][0])) for row in of_one] for of_one in some]
+            parts.append(self._collator.beside([self._told[of_one[-1]][0] for of_one in some], rows))
+        whole = sum(part.supervised for part in parts)
+        return tuple(replace(part, out_of=whole) for part in parts)
+
+    def example(self, row: int, read: int = 0) -> Example:
+        """The decision of a row, without the first tokens of its log where they have been read."""
         log, now, answer = self._told[row]
         codes = None if self.codes is None else self.codes[row].tolist()
-        return pictured_turn(self._model, log, now, self._demos.view(self._demos.reader[row]), codes, answer)
+        return pictured_turn(self._model, log, now, self._demos.view(self._demos.reader[row]), codes, answer, read)
 
 
 @torch.no_grad()

@@ -8,9 +8,11 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from proprio_mllm.evaluation.lessons import Lessons
+from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import build_model, build_processor, load_model, save_model
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
@@ -20,6 +22,7 @@ from proprio_mllm.training.pipeline import Pipeline, base_model_config
 from proprio_mllm.training.rollouts import read_rollouts
 from proprio_mllm.training.stages import STAGES
 from proprio_mllm.training.stages.inputs import episodes_in_words, lesson_folders, lessons_of, turns_of
+from proprio_mllm.training.turns import TURNS
 from tests.training.conftest import collect, correct
 
 
@@ -49,6 +52,31 @@ def test_a_turn_is_the_decision_of_its_row(trained: Pipeline) -> None:
         learnt = [token for token, target in zip(example.tokens.ids, example.tokens.targets, strict=True) if target]
         assert learnt == words.tokens(turn.answer)
         assert np.array_equal(example.views[0].image, demos.view(demos.reader[int(row)]).image)
+
+
+@pytest.mark.parametrize("stage", ["base", "selu"])
+def test_decisions_beside_a_log_are_learnt_as_alone(trained: Pipeline, stage: str) -> None:
+    model = load_model(trained.paths.model(stage), trainable=True).eval()
+    tokens = MotionTokenizer.load(trained.paths.model("tokenizer")) if model.cfg.proprioception else None
+    turns = turns_of(trained, model, lessons_of(trained, model.cfg), tokens)
+    parts = turns.batch(np.random.default_rng(3), 6)
+    assert [part.input_ids.shape[0] for part in parts] == [4 * TURNS, 2 * TURNS]
+    asked: list[Example] = []
+    example = turns.example
+    turns.example = lambda row, read=0: asked.append(example(row)) or example(row, read)  # type: ignore[method-assign]
+    turns.batch(np.random.default_rng(3), 6)
+    collate = Collator(model.processor, model.cfg)
+    packed = sum(model(part).loss for part in parts)
+    alone = [model(collate([one])) for one in asked]
+    count = sum(out.supervised for out in alone)
+    assert count == parts[0].out_of and sum(model(part).correct for part in parts) == sum(out.correct for out in alone)
+    plain = sum(out.loss * out.supervised for out in alone) / count
+    torch.testing.assert_close(packed, plain, atol=1e-4, rtol=1e-4)
+    learnt = [one for one in model.parameters() if one.requires_grad]
+    for one, other in zip(*(torch.autograd.grad(loss, learnt, allow_unused=True) for loss in (packed, plain)), strict=True):
+        assert (one is None) == (other is None)
+        if one is not None and other is not None:
+            torch.testing.assert_close(one, other, atol=2e-4, rtol=1e-3)
 
 
 def test_episodes_in_words_are_learnt_through_the_adapter(trained: Pipeline) -> None:
