@@ -1,4 +1,4 @@
-"""Configurations of Qwen2.5-VL backbones: small ones that are trained from scratch, and the released ones' shapes."""
+"""Qwen2.5-VL backbones: small ones that are trained from scratch, the released ones' shapes, and how patches are embedded."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from torch import Tensor, nn
+from torch.nn import functional
 from transformers import Qwen2_5_VLConfig
 
 from configs.schema.model import ModelConfig
@@ -91,3 +93,22 @@ def backbone_config(cfg: ModelConfig, processor: ProprioProcessor) -> Qwen2_5_VL
         vision_end_token_id=token("<|vision_end|>"),
         tie_word_embeddings=True,
     )
+
+
+class PatchEmbedding(nn.Module):
+    """Qwen's patch embedding as the matrix product that it is, under the same name of its weights.
+
+    A convolution whose kernel and stride are a patch took 70 % of the small tower's time on two cores.
+
+    Args:
+        proj: Qwen's convolution.
+    """
+
+    def __init__(self, proj: nn.Conv3d) -> None:
+        super().__init__()
+        self.proj = proj
+
+    def forward(self, hidden_states: Tensor) -> Tensor:
+        """Embeddings (P, D) of patches (P, 1176), as Qwen's image processor gives them."""
+        weight = self.proj.weight
+        return functional.linear(hidden_states.to(weight.dtype), weight.flatten(1))

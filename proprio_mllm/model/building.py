@@ -34,7 +34,7 @@ from transformers import BitsAndBytesConfig, Qwen2_5_VLForConditionalGeneration
 from configs.schema.model import ModelConfig
 from configs.validate import build
 from data.files import file_hash, new_folder, read_json
-from proprio_mllm.model.backbone import backbone_config
+from proprio_mllm.model.backbone import PatchEmbedding, backbone_config
 from proprio_mllm.model.groups import adapter_of
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
@@ -110,6 +110,8 @@ def build_model(
             vlm = Qwen2_5_VLForConditionalGeneration.from_pretrained(cfg.weights, dtype=dtype, **quantised)
         else:
             vlm = Qwen2_5_VLForConditionalGeneration(backbone_config(cfg, processor)).to(dtype)
+        visual: Any = vlm.model.visual
+        visual.patch_embed = PatchEmbedding(visual.patch_embed.proj)
         _extend(vlm, len(processor.tokenizer))
         motion_ids = add_motion_tokens(processor.tokenizer, cfg.motion.vocabulary)
         if point_map is None and cfg.cse.enabled:

@@ -2,7 +2,7 @@
 
 The wrapper computes the visual tokens, passes them through the CSE and the additive MPE, and gives them to the model as
 `mm_encoder_outputs` together with position ids from the collator. With `mpe.mode=mrope` and `cse.enabled=false` the result is
-the base model's, bit for bit.
+the base model's, bit for bit but for the patch embedding (`backbone.PatchEmbedding`).
 
 Shape letters: B batch, S sequence, I images, N visual tokens per image, D hidden size, V vocabulary.
 """

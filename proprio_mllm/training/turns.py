@@ -83,7 +83,7 @@ class Turns:
         """Training decisions of some episodes, longer ones more often, in parts of similar length."""
         shares = np.array([len(rows) for rows in self._episodes])
         chosen = rng.choice(len(self._episodes), episodes, p=shares / shares.sum())
-        drawn = [np.sort(rng.choice(self._episodes[i], TURNS, replace=shares[i] < TURNS)) for i in chosen]
+        drawn = [np.sort(rng.choice(self._episodes[i], TURNS, replace=bool(shares[i] < TURNS))) for i in chosen]
         drawn.sort(key=lambda rows: len(self._told[rows[-1]][0]))
         parts: list[Batch] = []
         for some in (drawn[first : first + _EPISODES] for first in range(0, episodes, _EPISODES)):

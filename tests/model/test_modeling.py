@@ -3,6 +3,7 @@ import dataclasses
 import pytest
 import torch
 from peft import PeftModel
+from transformers.models.qwen2_5_vl.modeling_qwen2_5_vl import Qwen2_5_VisionPatchEmbed
 
 from proprio_mllm.model.batch import Collator
 from proprio_mllm.model.building import add_adapter, build_model
@@ -37,6 +38,14 @@ def test_switches_off_give_the_base_model_exactly(cfg, build, plain, switch):
     assert torch.equal(ours.logits[real], masked.logits[real])
     torch.testing.assert_close(ours.logits[real], theirs.logits[real], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(ours.loss, theirs.loss, atol=1e-5, rtol=1e-5)
+
+
+def test_patches_are_embedded_as_qwen_does(cfg, build, plain, switch):
+    model, collate = build(switch(cfg, "mrope", cse=False))
+    embed, pixels = model.core.model.visual.patch_embed, collate(plain).images.pixel_values
+    theirs = Qwen2_5_VisionPatchEmbed(embed_dim=embed.proj.out_channels)
+    theirs.proj = embed.proj
+    torch.testing.assert_close(embed(pixels), theirs(pixels), atol=1e-5, rtol=1e-4)
 
 
 def test_position_ids_of_mrope_are_qwens(cfg, build, plain, switch):
