@@ -44,7 +44,8 @@ class Browser:
         read, self._write = os.pipe()
         self._read, write = os.pipe()
         # The browser reads from descriptor 3 and writes to 4; a shell puts the pipes there.
-        options = "--headless=new --no-sandbox --disable-gpu --remote-debugging-pipe"
+        # Without a GPU, a scene in 3D that nothing looks at would take all cores.
+        options = "--headless=new --no-sandbox --disable-gpu --disable-3d-apis --remote-debugging-pipe"
         command = f'exec "$0" {options} --user-data-dir="$1" 3<&{read} 4>&{write}'
         self._process = subprocess.Popen(
             ["bash", "-c", command, program, self._profile], pass_fds=(read, write), stderr=subprocess.DEVNULL
