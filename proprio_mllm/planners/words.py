@@ -14,6 +14,7 @@ lessons are so. The log, in which failed steps stand with their codes, is the sa
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -42,6 +43,8 @@ from proprio_mllm.model.word_tokens import WordTokens, tokens_of
 from proprio_mllm.model.wording import Words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, Usage, check_weights
+
+logger = logging.getLogger(__name__)
 
 #: Refusals of a step from one stance after which another one is taken.
 _REFUSALS: Final = 2
@@ -109,7 +112,10 @@ class WordsPlanner:
     ) -> None:
         self.model, self.motion, self.temperature, self.insist = model, motion, temperature, insist
         words = tokens_of(model.processor.tokenizer)
-        self.reflection = reflection and (not isinstance(words, WordTokens) or "why" in words.known)
+        learnt = not isinstance(words, WordTokens) or "why" in words.known
+        if not (learnt or reflection):
+            logger.warning("reflection=off changes nothing: this model has not learnt to reflect")
+        self.reflection = reflection and learnt
         self.image_size = model.cfg.image_size if model.cfg.sees else 0
         self._tokenizer = model.processor.tokenizer
         self._collator = Collator(model.processor, model.cfg)

@@ -200,9 +200,14 @@ def test_reflection_is_said_and_the_log_is_the_same_without(planner: WordsPlanne
     assert said[silent][2].text == said[silent][2].step.to_text()  # type: ignore[union-attr]
 
 
-def test_a_model_that_has_not_learnt_to_reflect_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_that_has_not_learnt_to_reflect_does_not(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr(Lessons, "words", lambda self, words=Lessons.words: tuple(w for w in words(self) if w != "why"))
-    assert not small().reflection
+    made = small()
+    assert not made.reflection and not caplog.records
+    assert not WordsPlanner(made.model, reflection=False).reflection
+    assert "has not learnt to reflect" in caplog.text
 
 
 def test_temperature_draws_from_the_episodes_generator(planner: WordsPlanner) -> None:
