@@ -21,11 +21,7 @@ from proprio_mllm.planners.protocol import Planner
 from proprio_mllm.planners.random_planner import RandomPlanner
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 
-
-def _mllm(cfg: ModelPlanner) -> Planner:
-    from proprio_mllm.planners.words import WordsPlanner  # torch loads only where a model is used
-
-    return WordsPlanner.load(cfg.weights, cfg.temperature, cfg.train, cfg.insist, cfg.adapter, cfg.reflection == "on")
+BUILT_IN: Final[Mapping[str, Callable[[int], Planner]]] = {"random": RandomPlanner, "scripted": ScriptedPlanner}
 
 
 def make_planner(cfg: PlannerConfig) -> Planner:
@@ -35,7 +31,9 @@ def make_planner(cfg: PlannerConfig) -> Planner:
         ValueError: on a kind that is not made here.
     """
     if isinstance(cfg, ModelPlanner):
-        return _mllm(cfg)
+        from proprio_mllm.planners.words import WordsPlanner  # torch loads only where a model is used
+
+        return WordsPlanner.load(cfg.weights, cfg.temperature, cfg.train, cfg.insist, cfg.adapter, cfg.reflection == "on")
     if isinstance(cfg, FilePlanner):
         return load_planner(cfg.source)
     if isinstance(cfg, BuiltInPlanner) and cfg.kind in BUILT_IN:
@@ -43,7 +41,6 @@ def make_planner(cfg: PlannerConfig) -> Planner:
     raise ValueError(f"planner kind {cfg.kind!r} is not made here; allowed: file, mllm, {', '.join(BUILT_IN)}")
 
 
-BUILT_IN: Final[Mapping[str, Callable[[int], Planner]]] = {"random": RandomPlanner, "scripted": ScriptedPlanner}
 CHAT_PLANNERS: Final[Mapping[str, Callable[[Backend, ChatOptions], Planner]]] = {
     "dag_plan": DagPlanner,
     "llm_planner": LlmPlanner,

@@ -190,7 +190,7 @@ class WordsPlanner:
         seen = observation if isinstance(observation, Observation) else None
         turn = turn_example(self.model, state.log, now, seen, self.motion)
         belief = state.sightings.belief
-        reflects = self.reflection and belief.failed is not None
+        reflects = state.reflects and belief.failed is not None
         return _Answer(AnswerGrammar(observation.known_objects, None if self.insist else belief, reflects), state, turn)
 
     def _write(self, answers: Sequence[_Answer]) -> None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, fields
 
 from configs.schema.backend import BackendConfig
 from configs.schema.planner import AskingPlanner
-
-_OF_PLANNER: Final = ("replans", "horizon", "history", "body", "examples", "memory", "parallel")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,5 +41,6 @@ class ChatOptions:
     @staticmethod
     def of(planner: AskingPlanner, backend: BackendConfig) -> ChatOptions:
         """From the two configurations."""
-        own = {name: getattr(planner, name) for name in _OF_PLANNER if hasattr(planner, name)}
-        return ChatOptions(backend.image_size, backend.max_tokens, backend.temperature, planner.reflection == "on", **own)
+        values = {one.name: getattr(planner, one.name) for one in fields(ChatOptions) if hasattr(planner, one.name)}
+        values |= {name: getattr(backend, name) for name in ("image_size", "max_tokens", "temperature")}
+        return ChatOptions(**values | {"reflection": planner.reflection == "on"})
