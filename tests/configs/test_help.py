@@ -53,6 +53,9 @@ def test_every_group_and_field_is_there(capsys: pytest.CaptureFixture[str]) -> N
         assert max(map(len, text.splitlines())) < 140
         if root == "eval":  # groups that are not chosen show their fields too
             assert "  backend.token_limit_field=max_tokens" in text and "  experiment.planners=…" in text
+            told = " ".join(text.split())
+            assert "folder of the stored model (kind mllm)" in told and "(kind file, plain)" in told
+            assert "name printed in tables. planner" in told  # which every kind has
 
 
 def test_meanings_come_from_the_docstrings() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 from configs.schema.backend import BackendConfig
 from configs.schema.planner import AskingPlanner
@@ -41,6 +42,8 @@ class ChatOptions:
     @staticmethod
     def of(planner: AskingPlanner, backend: BackendConfig) -> ChatOptions:
         """From the two configurations."""
-        values = {one.name: getattr(planner, one.name) for one in fields(ChatOptions) if hasattr(planner, one.name)}
+        values: dict[str, Any] = {
+            one.name: getattr(planner, one.name) for one in fields(ChatOptions) if hasattr(planner, one.name)
+        }
         values |= {name: getattr(backend, name) for name in ("image_size", "max_tokens", "temperature")}
         return ChatOptions(**values | {"reflection": planner.reflection == "on"})
