@@ -46,4 +46,5 @@ class ChatOptions:
             one.name: getattr(planner, one.name) for one in fields(ChatOptions) if hasattr(planner, one.name)
         }
         values |= {name: getattr(backend, name) for name in ("image_size", "max_tokens", "temperature")}
-        return ChatOptions(**values | {"reflection": planner.reflection == "on"})
+        values["reflection"] = planner.reflection == "on"
+        return ChatOptions(**values)
