@@ -132,28 +132,23 @@ def _attention(
 def _attend(query: Tensor, key: Tensor, value: Tensor, m: int, anchors: Tensor) -> Tensor:
     """Attention of scaled queries (B, H, S, D): (B, S, H, D)."""
     n, device = anchors.shape[1], query.device
-    of_log = _weighted(query[:, :, :m], key[:, :, :m], value[:, :, :m], torch.ones(m, m, device=device).tril() > 0)
-    # branches are rows of their own (B * N, H, W, D), with the log's keys before theirs
-    own, behind = zip(*(_split(one, m, n) for one in (query, key, value)), strict=True)
-    w = own[0].shape[2]
-    seen = (torch.arange(m, device=device) < anchors.flatten()[:, None])[:, None, None].expand(-1, 1, w, -1)
-    past = (torch.ones(w, w, device=device).tril() > 0).expand(len(seen), 1, -1, -1)
-    keys, values = (torch.cat([behind[index], own[index]], 2) for index in (1, 2))
-    of_branches = _weighted(own[0], keys, values, torch.cat([seen, past], -1))  # (B * N, H, W, D)
-    rows = of_branches.unflatten(0, (-1, n)).transpose(2, 3).flatten(1, 2)  # (B, N * W, H, D)
-    return torch.cat([of_log.transpose(1, 2), rows], 1)
+    (q_log, q_own), (k_log, k_own), (v_log, v_own) = (
+        (rows[:, :, :m], rows[:, :, m:].unflatten(2, (n, -1))) for rows in (query, key, value)
+    )
+    of_log = torch.softmax(q_log @ k_log.mT + _past(m, query), -1) @ v_log
+    # the log's keys are met by all branches of a row at once; a branch meets its own (B, H, N, W, W)
+    told = torch.arange(m, device=device) < anchors[..., None]  # (B, N, M)
+    unseen = torch.zeros_like(told, dtype=query.dtype).masked_fill(~told, -torch.inf)[:, None, :, None]
+    to_log = (q_own.flatten(2, 3) @ k_log.mT).unflatten(2, (n, -1)) + unseen
+    to_own = q_own @ k_own.mT + _past(q_own.shape[3], query)
+    shares = torch.softmax(torch.cat([to_log, to_own], -1), -1)
+    of_branches = shares[..., :m].flatten(2, 3) @ v_log + (shares[..., m:] @ v_own).flatten(2, 3)
+    return torch.cat([of_log, of_branches], 2).transpose(1, 2)
 
 
-def _weighted(query: Tensor, key: Tensor, value: Tensor, seen: Tensor) -> Tensor:
-    """Attention where `seen` says so."""
-    unseen = torch.zeros_like(seen, dtype=query.dtype).masked_fill(~seen, -torch.inf)
-    return torch.softmax(query @ key.mT + unseen, -1) @ value
-
-
-def _split(rows: Tensor, m: int, n: int) -> tuple[Tensor, Tensor]:
-    """(B, H, S, D) as the branches (B * N, H, W, D), and the log once for each of them, (B * N, H, M, D)."""
-    own = rows[:, :, m:].unflatten(2, (n, -1)).transpose(1, 2).flatten(0, 1)
-    return own, rows[:, None, :, :m].expand(-1, n, -1, -1, -1).flatten(0, 1)
+def _past(length: int, like: Tensor) -> Tensor:
+    """Zero where a token sees, minus infinity where it does not (length, length)."""
+    return torch.full((length, length), -torch.inf, dtype=like.dtype, device=like.device).triu(1)
 
 
 def read_branches(model: Any, input_ids: Tensor, position_ids: Tensor, layout: Branches, kept: Tensor, **inputs: Any) -> Tensor:
