@@ -16,7 +16,7 @@ from interface.observation import Observation
 from proprio_mllm.backends.protocol import Backend
 from proprio_mllm.planners.chat.asking import Asker
 from proprio_mllm.planners.chat.options import ChatOptions
-from proprio_mllm.planners.chat.role import role
+from proprio_mllm.planners.chat.planner import role
 from proprio_mllm.planners.chat.view import encoded
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 

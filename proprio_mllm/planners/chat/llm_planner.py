@@ -25,15 +25,15 @@ from interface.feedback import Feedback
 from interface.observation import Observation
 from interface.steps import Action, ActionError, PlanStep
 from proprio_mllm.backends.protocol import Backend, ChatImage
-from proprio_mllm.planners.chat.asking import Answer, Asker
+from proprio_mllm.planners.chat.asking import Answer
 from proprio_mllm.planners.chat.embedding import Embedder
 from proprio_mllm.planners.chat.options import ChatOptions
-from proprio_mllm.planners.chat.plain import system_text
+from proprio_mllm.planners.chat.planner import ChatPlanner
 from proprio_mllm.planners.chat.recall import load_tasks
-from proprio_mllm.planners.chat.reflection import Seen, completed_steps, reflect
+from proprio_mllm.planners.chat.reflection import Seen, completed_steps
 from proprio_mllm.planners.chat.replies import Plan, Reflection
 from proprio_mllm.planners.chat.spoken import type_words
-from proprio_mllm.planners.chat.view import encoded, scene_text
+from proprio_mllm.planners.chat.view import encoded
 from proprio_mllm.planners.memory import MemoryEpisode, MemoryFileError
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 
@@ -47,7 +47,7 @@ WHOLE_PLAN_RULES: Final = (
 _DONE: Final = "Done()"
 
 
-class LlmPlanner:
+class LlmPlanner(ChatPlanner):
     """Plans to the end and follows the plan.
 
     Args:
@@ -59,31 +59,20 @@ class LlmPlanner:
         EmbeddingError: when a package is not installed.
     """
 
-    privileged = False
-
     def __init__(self, backend: Backend, options: ChatOptions) -> None:
         if options.memory is None:
             raise MemoryFileError("LLM-Planner needs a memory, got None: set planner.memory=FOLDER")
-        self._backend, self._options = backend, options
+        super().__init__(backend, options)
         self._tasks = load_tasks(options.memory)
-        self.image_size = options.image_size
-        self._start(0, "", "")
 
-    def _start(self, seed: int, system: str, examples: str) -> None:
-        options = self._options
-        self._asker = Asker(self._backend, options.max_tokens, options.temperature, seed)
-        self._system, self._examples = system, examples
+    def _start(self, task: TaskInfo, rng: np.random.Generator) -> None:
+        """Looks up examples for the new episode."""
         self._queue: deque[str] = deque()
-        self._before: Seen | None = None
         self._asked = 0
         self._wrong = False
-
-    def reset(self, task: TaskInfo, rng: np.random.Generator) -> None:
-        """Forgets the last episode and looks up examples for the new one."""
-        seed = int(rng.integers(2**31))
         nearest = self._tasks.nearest(task.instruction, self._options.examples)
         examples = [example_text(n, one, int(rng.integers(len(one.plan)))) for n, one in enumerate(nearest, start=1)]
-        self._start(seed, system_text(task.robot), "\n\n".join(examples))
+        self._examples = "\n\n".join(examples)
 
     def step(self, observation: Observation, feedback: Feedback | None) -> PlannerReply:
         """The next step of the plan, or of a new one.
@@ -92,7 +81,7 @@ class LlmPlanner:
             BackendError: when the backend gives no reply.
         """
         failed = feedback is not None and not feedback.success
-        before, self._before = self._before, Seen.of(observation)
+        before = self._look(observation)
         broken = failed or self._wrong or not self._queue
         self._wrong = False
         if broken and self._asked <= self._options.replans:
@@ -103,15 +92,14 @@ class LlmPlanner:
 
     def _plan(self, observation: Observation, failure: Feedback | None, before: Seen | None) -> PlannerReply:
         """Asks for the remaining plan and takes its first step; without a valid one the old plan stays."""
-        options = self._options
         self._asked += 1
         answer: Answer[Plan] | Answer[Reflection]
-        if failure is not None and options.reflection:
+        if failure is not None and self._options.reflection:
             extra = f"Your next steps must be the whole remaining plan, with {_DONE} as its last.\n\n{self._examples}"
-            answer = reflect(self._asker, self._system, observation, failure, before, options.history, options.body, extra)
+            answer = self._reflection(observation, failure, before, extra)
         else:
             done = "; ".join(completed_steps(observation.history)) or "nothing"
-            now = f"Now your task.\nCompleted: {done}\n{scene_text(observation, options.history, options.body)}"
+            now = f"Now your task.\nCompleted: {done}\n{self._scene(observation)}"
             content: tuple[str | ChatImage, ...] = (self._examples, now, encoded(observation.image))
             answer = self._asker.ask(f"{self._system}\n\n{WHOLE_PLAN_RULES}", content, Plan)
         if answer.value is None or not answer.value.steps:

@@ -25,13 +25,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from interface.feedback import Feedback
 from interface.observation import Observation
 from proprio_mllm.backends.protocol import Backend, ChatImage
-from proprio_mllm.planners.chat.asking import Answer, Asker
+from proprio_mllm.planners.chat.asking import Answer
 from proprio_mllm.planners.chat.options import ChatOptions
-from proprio_mllm.planners.chat.plain import system_text
+from proprio_mllm.planners.chat.planner import ChatPlanner
 from proprio_mllm.planners.chat.recall import Key, Moment, load_moments
-from proprio_mllm.planners.chat.reflection import Seen, reflect
 from proprio_mllm.planners.chat.replies import Reflection, ReplyError, read_steps
-from proprio_mllm.planners.chat.view import encoded, scene_text
+from proprio_mllm.planners.chat.view import encoded
 from proprio_mllm.planners.memory import MemoryEpisode, MemoryFileError
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 
@@ -79,7 +78,7 @@ class Thought(BaseModel):
     steps: list[str] = Field(description="the next step, written in the action grammar; empty to look the key up first")
 
 
-class RapPlanner:
+class RapPlanner(ChatPlanner):
     """Looks up experience before it acts.
 
     Args:
@@ -92,29 +91,17 @@ class RapPlanner:
         SightError: when the memory has pictures and their encoder is not there.
     """
 
-    privileged = False
-
     def __init__(self, backend: Backend, options: ChatOptions) -> None:
         if options.memory is None:
             raise MemoryFileError("RAP needs a memory, got None: set planner.memory=FOLDER")
-        self._backend, self._options = backend, options
+        super().__init__(backend, options)
         self._moments = load_moments(options.memory)
-        self.image_size = options.image_size
-        self._start(0, "", "", "")
 
-    def _start(self, seed: int, system: str, instruction: str, family: str) -> None:
-        options = self._options
-        self._asker = Asker(self._backend, options.max_tokens, options.temperature, seed)
-        self._system, self._instruction, self._family = system, instruction, family
+    def _start(self, task: TaskInfo, rng: np.random.Generator) -> None:
+        """Predicts the category of the new task."""
+        self._instruction, self._family = task.instruction, self._moments.tasks.family(task.instruction)
         self._plan: tuple[str, ...] = ()
         self._key: Key | None = None
-        self._before: Seen | None = None
-        self._replans = 0
-
-    def reset(self, task: TaskInfo, rng: np.random.Generator) -> None:
-        """Forgets the last episode and predicts the category of the new task."""
-        family = self._moments.tasks.family(task.instruction)
-        self._start(int(rng.integers(2**31)), system_text(task.robot), task.instruction, family)
 
     def step(self, observation: Observation, feedback: Feedback | None) -> PlannerReply:
         """The next step.
@@ -122,20 +109,15 @@ class RapPlanner:
         Raises:
             BackendError: when the backend gives no reply.
         """
-        options = self._options
-        before, self._before = self._before, Seen.of(observation)
+        before = self._look(observation)
         if not self._plan:
             outline = self._outline(observation)
             if outline.value is None or not outline.value.plan:
                 return self._asker.reply(outline.text, None, outline.error or "empty plan")
             self._plan, self._key = tuple(outline.value.plan), _key(outline.value.key)
             return self._reply(self._think(observation, _NOW))
-        if feedback is not None and not feedback.success and options.reflection and self._replans < options.replans:
-            self._replans += 1
-            extra = self._experience(observation)
-            return self._reply(
-                reflect(self._asker, self._system, observation, feedback, before, options.history, options.body, extra)
-            )
+        if feedback is not None and not feedback.success and self._reflects():
+            return self._reply(self._reflection(observation, feedback, before, self._experience(observation)))
         answer = self._think(observation)
         if answer.value is not None and not answer.value.steps:
             answer = self._think(observation, _NOW)
@@ -156,8 +138,7 @@ class RapPlanner:
         return answer
 
     def _content(self, observation: Observation, text: str) -> tuple[str | ChatImage, ...]:
-        scene = scene_text(observation, self._options.history, self._options.body)
-        return text, f"Now your task.\n{scene}", encoded(observation.image)
+        return text, f"Now your task.\n{self._scene(observation)}", encoded(observation.image)
 
     def _experience(self, observation: Observation) -> str:
         """The overall plan, and what memory has on the key."""

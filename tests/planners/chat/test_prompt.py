@@ -11,7 +11,7 @@ from interface.actions import ACTIONS
 from interface.failures import FailureCode
 from interface.manual import action_manual, code_manual
 from interface.observation import HistoryItem
-from proprio_mllm.planners.chat.role import role
+from proprio_mllm.planners.chat.planner import role
 from proprio_mllm.planners.chat.view import body_text, encoded, log_text, scene_text
 from tests.planners.chat.script import observation
 

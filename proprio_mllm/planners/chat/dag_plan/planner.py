@@ -15,8 +15,7 @@ import numpy as np
 
 from interface.feedback import Feedback
 from interface.observation import Observation
-from proprio_mllm.backends.protocol import Backend
-from proprio_mllm.planners.chat.asking import REFLECTION, Answer, Asker
+from proprio_mllm.planners.chat.asking import REFLECTION, Answer
 from proprio_mllm.planners.chat.dag_plan.checks import GraphError, check_graph
 from proprio_mllm.planners.chat.dag_plan.execution import Execution
 from proprio_mllm.planners.chat.dag_plan.graph import Graph, GraphReply, RevisedGraph
@@ -30,9 +29,7 @@ from proprio_mllm.planners.chat.dag_plan.prompt import (
     graph_text,
     mending_text,
 )
-from proprio_mllm.planners.chat.options import ChatOptions
-from proprio_mllm.planners.chat.plain import system_text
-from proprio_mllm.planners.chat.reflection import Seen
+from proprio_mllm.planners.chat.planner import ChatPlanner
 from proprio_mllm.planners.chat.replies import ReplyError
 from proprio_mllm.planners.chat.view import encoded
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
@@ -41,33 +38,13 @@ from proprio_mllm.planners.protocol import PlannerReply, TaskInfo
 _REPAIR = "repair"
 
 
-class DagPlanner:
-    """Plans a graph and carries it out.
+class DagPlanner(ChatPlanner):
+    """Plans a graph and carries it out."""
 
-    Args:
-        backend: who answers.
-        options: see `ChatOptions`.
-    """
-
-    privileged = False
-
-    def __init__(self, backend: Backend, options: ChatOptions) -> None:
-        self._backend, self._options = backend, options
-        self.image_size = options.image_size
-        self._start(0, "")
-
-    def _start(self, seed: int, system: str) -> None:
-        options = self._options
-        self._asker = Asker(self._backend, options.max_tokens, options.temperature, seed)
-        self._system = system
+    def _start(self, task: TaskInfo, rng: np.random.Generator) -> None:
+        self._system += f"\n\n{GRAPH_RULES}"
         self._memory = Memory()
         self._execution: Execution | None = None
-        self._before: Seen | None = None
-        self._replans = 0
-
-    def reset(self, task: TaskInfo, rng: np.random.Generator) -> None:
-        """Forgets the last episode."""
-        self._start(int(rng.integers(2**31)), f"{system_text(task.robot)}\n\n{GRAPH_RULES}")
 
     def step(self, observation: Observation, feedback: Feedback | None) -> PlannerReply:
         """The next step of the graph, after asking for one where there is none or it has failed.
@@ -78,14 +55,13 @@ class DagPlanner:
         execution, options = self._execution, self._options
         failed = execution is not None and execution.hear(feedback)
         self._memory.look(observation)
-        before, self._before = self._before, Seen.of(observation)
+        before = self._look(observation)
         text = ""
         try:
             if execution is None:
                 text, graph = self._ask(graph_text(observation, options, self._memory.hands), GraphReply, observation)
                 execution = self._begin(graph, observation)
-            elif failed and feedback is not None and options.reflection and self._replans < options.replans:
-                self._replans += 1
+            elif failed and feedback is not None and self._reflects():
                 question = failure_text(observation, options, self._memory.hands, feedback, before, execution.text())
                 text, graph = self._ask(question, RevisedGraph, observation)
                 execution = self._begin(graph, observation)
