@@ -105,7 +105,8 @@ def make_optimizer(module: nn.Module, cfg: LoopConfig) -> torch.optim.Optimizer:
     ]
     groups = [group for group in groups if group["params"]]
     if matrices:
-        return Muon(matrices, groups, cfg.lr, weight_decay=cfg.weight_decay, adam_share=cfg.adam_share)
+        dtype = torch.bfloat16 if cfg.precision == "bf16" else torch.float32
+        return Muon(matrices, groups, cfg.lr, weight_decay=cfg.weight_decay, adam_share=cfg.adam_share, dtype=dtype)
     return torch.optim.AdamW(groups, lr=cfg.lr, betas=(0.9, 0.99))
 
 

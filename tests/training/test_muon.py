@@ -31,6 +31,21 @@ def test_singular_values_become_about_one(shape: tuple[int, int]) -> None:
     assert torch.nn.functional.cosine_similarity(near.flatten(), (left @ right).flatten(), dim=0) > 0.95
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_matrices_of_all_shapes_move_as_each_would_alone(dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(0)
+    grads = [torch.randn(*shape, generator=generator) for shape in ((8, 32), (16, 16), (8, 32), (32, 8), (16, 16))]
+    weights = [nn.Parameter(torch.zeros_like(grad)) for grad in grads]
+    optimizer = Muon(weights, [], 0.01, weight_decay=0.0, dtype=dtype)
+    for weight, grad in zip(weights, grads, strict=True):
+        weight.grad = grad
+    optimizer.step()
+    for weight, grad in zip(weights, grads, strict=True):
+        expected = -0.01 * 0.4 * max(grad.shape) ** 0.5 * orthogonalised(grad)
+        tolerance = 1e-6 if dtype is torch.float32 else 0.05 * float(expected.abs().max())
+        assert torch.allclose(weight, expected, atol=tolerance), float((weight - expected).abs().max())
+
+
 def test_tables_and_the_output_layer_are_no_matrices() -> None:
     model = nn.ModuleDict({"embed": nn.Embedding(5, 4), "mlp": nn.Linear(4, 3), "lm_head": nn.Linear(4, 5, bias=False)})
     assert [id(one) for one in linear_weights(model)] == [id(model["mlp"].weight)]
