@@ -110,4 +110,4 @@ def test_every_stage_runs_in_two_processes(shards: Path, tmp_path: Path) -> None
         metrics = [json.loads((root / "done.json").read_text())["metrics"] for root in (one, two)]
         assert set(metrics[0]) == set(metrics[1])
     one, two = (StagePaths(debug_config(folder)).model("words") / "vlm" / "model.safetensors" for folder in folders)
-    torch.testing.assert_close(load_file(one), load_file(two), atol=2e-3, rtol=1e-2)  # bfloat16, and Muon's orthogonal steps
+    torch.testing.assert_close(load_file(one), load_file(two), atol=4e-3, rtol=1e-2)  # bfloat16, and Muon's orthogonal steps
