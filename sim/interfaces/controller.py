@@ -48,9 +48,9 @@ THOR_CODES: Final[Mapping[str, str]] = {
     FailureCode.RECEPTACLE_CLOSED: "ReceptacleNotOpen",
     FailureCode.RECEPTACLE_FULL: "ReceptacleFull",
 }
-#: Actions that need `privileged=True`.
 #: States that are kept at a time; each takes about two megabytes.
 _MOST_SAVED: Final = 100
+#: Actions that need `privileged=True`.
 _PRIVILEGED: Final = ("TP", "GetInteractablePoses", "SetObjectPoses", "InitialRandomSpawn")
 _MAX_POSES: Final = 1000
 
