@@ -16,7 +16,7 @@ from pathlib import Path
 from configs.schema.checks import defaults_of
 from configs.schema.eval import EvalConfig
 from configs.schema.planner import PLANNER_KINDS, BuiltInPlanner, ModelPlanner, PlannerConfig
-from configs.validate import build
+from configs.validate import allowed_values, build
 from interface.episode import EpisodeRecord
 from interface.failures import INVALID_OUTPUT
 from interface.feedback import Feedback
@@ -109,8 +109,8 @@ def find_record(run: Run, task: str, trial: int) -> EpisodeRecord:
     for record in run.records:
         if (record.task, record.trial) == (task, trial):
             return record
-    names = ", ".join(sorted({record.task for record in run.records}))
-    raise ValueError(f"{run.folder}: no episode of task {task!r}, trial {trial}; it has {names}")
+    known = allowed_values(task, sorted({record.task for record in run.records}))
+    raise ValueError(f"{run.folder}: no episode of task {task!r}, trial {trial}; {known}")
 
 
 @dataclass(frozen=True, slots=True)

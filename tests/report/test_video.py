@@ -30,7 +30,7 @@ def test_an_episode_is_filmed_from_its_trace(acted_run: Path, tmp_path: Path, ca
     [
         (["{run}"], "expected RUN TASK"),
         (["{run}", "plant", "more"], "expected RUN TASK"),
-        (["{run}", "lamp"], "no episode of task 'lamp', trial 0; it has plant"),
+        (["{run}", "lamp"], "no episode of task 'lamp', trial 0; allowed: plant"),
         (["{run}", "plant", "trial=3"], "trial 3"),
         (["{run}", "plant", "out=x.avi"], "out must end in .mp4, got 'x.avi'"),
         (["{run}", "plant", "cameras=[nose]"], "['nose'] must be some of head"),
