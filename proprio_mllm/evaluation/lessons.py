@@ -201,7 +201,8 @@ def _of_log(
         if done and number + 1 == len(looks):
             record.look(shown, PlanStep((Action("Done"),)), "Done", "")
         elif job is not None:
-            record.look(shown, step if targets is None else targets[number], job.verb, job.target)
+            tries = any(action.spec.arms for action in step.actions)
+            record.look(shown, step if targets is None else targets[number], job.verb, job.target, tries)
         else:  # it gives up
             break
     return record.episode()
@@ -229,8 +230,8 @@ class _Record:
         self._prefix: tuple[str, ...] = ()
         self._turns: list[WordTurn] = []
 
-    def look(self, shown: Shown, step: PlanStep, verb: str, target: str | None) -> None:
-        """A moment and the teacher's answer."""
+    def look(self, shown: Shown, step: PlanStep, verb: str, target: str | None, tries: bool = False) -> None:
+        """A moment and the teacher's answer; `tries` as in `WordTurn`."""
         shown = self._renamed(shown)
         self._sightings.look(shown)
         if not self._turns:
@@ -243,7 +244,7 @@ class _Record:
         )
         reflection = reflection_words(self._sightings.belief.failed, PlanStep(actions)) if self._reflects else ()
         answer = answer_words(verb, self._id(target) if target else target, PlanStep(actions), reflection)
-        self._turns.append(WordTurn(state_words(self._sightings, self._reflects), answer, ()))
+        self._turns.append(WordTurn(state_words(self._sightings, self._reflects), answer, (), tries))
 
     def episode(self) -> WordEpisode:
         """What was written."""

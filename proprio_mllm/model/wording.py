@@ -67,11 +67,13 @@ class WordTurn:
         now: what stands before the answer.
         answer: what is learnt; empty where nothing is.
         taken: what the log says of the step that was taken, right or wrong.
+        tries: whether an arm would be tried here by all that words tell, so that what is seen decides.
     """
 
     now: Words
     answer: Words
     taken: Words
+    tries: bool = False
 
 
 @dataclass(frozen=True, slots=True)

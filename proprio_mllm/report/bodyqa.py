@@ -3,10 +3,10 @@
     python -m proprio_mllm bodyqa weights=weights/tiny/full [questions=2000] [robots=[h1,x1]] [blind=true]
     python -m proprio_mllm bodyqa backend=gpt4o
 
-Six questions on views of rooms that no stage trains on, with both robots posed anywhere in them: on which side of me is a
-thing, how far, how high, which arm reaches it better, which of my hands are open, how high is my pelvis. The answers are the
-simulator's own. Beside the share of right answers (with its Wilson interval) stand that of the commonest answer and, with
-`blind`, that of the same model with a grey picture and a body of zeros.
+Seven questions on views of rooms that no stage trains on, with both robots posed anywhere in them: on which side of me is a
+thing, how far, how high, which arm reaches it better, which arms are long enough, which of my hands are open, how high is my
+pelvis. The answers are the simulator's own. Beside the share of right answers (with its Wilson interval) stand that of the
+commonest answer and, with `blind`, that of the same model with a grey picture and a body of zeros.
 
 A stored model reads motion tokens and answers its own short questions. A model behind a backend is asked in English, with the
 picture and, unless `body=false`, its body in words (`proprio_mllm.planners.chat.view.body_text`); blind it gets neither.
@@ -57,7 +57,7 @@ from sim.collection.collect import collect
 from sim.scene.rooms import room_names
 from sim.tasks.sample import TRAIN_ROOMS
 
-_ABOUT_THINGS: Final = ("side", "distance", "height", "arm")
+_ABOUT_THINGS: Final = ("side", "distance", "height", "arm", "reach")
 _ABOUT_SELF: Final = ("hands", "pelvis")
 _KINDS: Final = (*_ABOUT_THINGS, *_ABOUT_SELF)
 #: What a model behind a backend may answer, and how it is asked for it.
@@ -66,6 +66,7 @@ _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "distance": ("near", "middle", "far"),
     "height": ("low", "level", "high"),
     "arm": ("left", "right", "either"),
+    "reach": ("left", "right", "both", "none"),
     "hands": ("left right", "left", "right", "none"),
 }
 _METRES: Final = "Answer with the metres alone, rounded to 0.05, such as 0.85."
@@ -78,7 +79,7 @@ class BodyQaConfig:
     Attributes:
         weights: folder of a stored model.
         backend: a model in `configs/backend`; in place of weights.
-        questions: how many, shared out among six kinds.
+        questions: how many, shared out among seven kinds.
         robots: whose bodies.
         blind: whether everything is asked once more without picture and body.
         body: whether a backend's model is told its body in words.
@@ -109,7 +110,7 @@ class Question:
     """One question about a view.
 
     Attributes:
-        kind: one of side, distance, height, arm, hands, pelvis.
+        kind: one of side, distance, height, arm, reach, hands, pelvis.
         thing: the object it is about, empty for questions about oneself.
         answer: the truth, in the words that stored models learn.
         row: the view.
@@ -161,8 +162,8 @@ def questions_of(views: Views, count: int, seed: int) -> list[Question]:
         hands, height = body_state(row.motion)
         found += [Question("hands", "", hands, row), Question("pelvis", "", height, row)]
     share = {kind: [one for one in found if one.kind == kind] for kind in _KINDS}
-    each = -(-count // len(_KINDS))
-    return [one for kind in _KINDS for one in share[kind][:each]][:count]
+    each, over = divmod(count, len(_KINDS))
+    return [one for place, kind in enumerate(_KINDS) for one in share[kind][: each + (place < over)]]
 
 
 def scores(asked: Sequence[Question], answer: Answering, blind: bool) -> list[Score]:

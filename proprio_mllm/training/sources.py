@@ -28,12 +28,20 @@ from proprio_mllm.model.batch import View
 from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, answers
-from proprio_mllm.model.questions import arm_answer, ask, distance_answer, height_answer, shift_answer, side_answer
+from proprio_mllm.model.questions import (
+    arm_answer,
+    ask,
+    distance_answer,
+    height_answer,
+    reach_answer,
+    shift_answer,
+    side_answer,
+)
 
 #: One in this many views, episodes and clips is never trained on.
 HELD_OUT = 20
 GROUNDING = ("side", "distance", "height")
-BODY_RELATIVE = ("arm", "shift")
+BODY_RELATIVE = ("arm", "reach", "shift")
 
 
 def held_out(key: str) -> bool:
@@ -133,6 +141,7 @@ class Views:
                     "distance": lambda c=centre: distance_answer(c),
                     "height": lambda c=centre: height_answer(c),
                     "arm": lambda c=centre: arm_answer(c),
+                    "reach": lambda c=centre: reach_answer(c, bodies),
                     "shift": lambda c=centre: shift_answer(c, bodies),
                 }[kind]()
                 found.append((ask(kind, str(obj["id"]), self.style), answer))

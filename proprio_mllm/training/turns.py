@@ -29,6 +29,8 @@ from proprio_mllm.training.words import LONGEST_LOG
 #: Decisions of an episode in a batch, and episodes that are computed together.
 TURNS: Final = 6
 _EPISODES: Final = 4
+#: How often a decision at which an arm would be tried is drawn for one at which words tell what to do.
+_TRIED: Final = 3.0
 
 
 class Turns:
@@ -59,6 +61,7 @@ class Turns:
         self.codes = None if tokens is None else demos.tokens(tokens)
         self._told: dict[int, tuple[list[int], list[int], list[int]]] = {}
         names = demos.reader.column("episode")
+        self._weights = np.ones(len(names))
         starts = [row for row, name in enumerate(names) if row == 0 or name != names[row - 1]]
         episodes = [episode for folder in folders for episode in told(folder)]
         for start, episode in zip(starts, episodes, strict=True):
@@ -68,6 +71,7 @@ class Turns:
                 if len(log) <= LONGEST_LOG * words.length:  # as in stage `words`
                     self._told[start + number] = (list(log), words.tokens(turn.now), words.tokens(turn.answer))
                 log += words.tokens(turn.taken)
+                self._weights[start + number] = _TRIED if turn.tries else 1.0
         rows = np.array(sorted(self._told), dtype=np.int64)
         self.train, self.test = np.intersect1d(rows, demos.split.train), np.intersect1d(rows, demos.split.test)
         self._collator = Collator(model.processor, model.cfg)
@@ -80,10 +84,13 @@ class Turns:
         return [self.example(int(row)) for row in rng.choice(self.train, size)]
 
     def batch(self, rng: np.random.Generator, episodes: int) -> tuple[Batch, ...]:
-        """Training decisions of some episodes, longer ones more often, in parts of similar length."""
-        shares = np.array([len(rows) for rows in self._episodes])
-        chosen = rng.choice(len(self._episodes), episodes, p=shares / shares.sum())
-        drawn = [np.sort(rng.choice(self._episodes[i], TURNS, replace=bool(shares[i] < TURNS))) for i in chosen]
+        """Training decisions of some episodes, longer ones more often, and tries of an arm, in parts of similar length."""
+        weights = [self._weights[rows] for rows in self._episodes]
+        shares = np.array([each.sum() for each in weights])
+        drawn: list[NDArray[np.int64]] = []
+        for i in rng.choice(len(shares), episodes, p=shares / shares.sum()):
+            rows = self._episodes[i]
+            drawn.append(np.sort(rng.choice(rows, TURNS, replace=len(rows) < TURNS, p=weights[i] / shares[i])))
         drawn.sort(key=lambda rows: len(self._told[rows[-1]][0]))
         parts: list[Batch] = []
         for some in (drawn[first : first + _EPISODES] for first in range(0, episodes, _EPISODES)):

@@ -28,7 +28,7 @@ from data.workers import worker_pool
 _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.
-_VERSION = {"views": 2, "demos": 3}
+_VERSION = {"views": 3, "demos": 3}
 #: Fields that do not change what is written.
 _UNKEYED = {
     "views": ("out", "workers", "noise", "medium_share", "foreseen"),

@@ -1,8 +1,10 @@
 """Views of posed robots: kinematics and a camera, no physics. The material of dense pretraining and of the point-map encoder.
 
 A world is furnished at random, then the robot is put into many poses: places, headings, pelvis heights with the matching legs,
-arms and hands. Each view comes with depth, segmentation by type, what is visible where, and a motion window that leads into the
-pose, so that a view has proprioception like any observation. Paper: the visual pretraining that a large model brings along.
+arms and hands. Half of them are where GoTo would bring it, since from there a planner has to say what is in reach; from
+elsewhere hardly anything is. Each view comes with depth, segmentation by type, what is visible where, and a motion window that
+leads into the pose, so that a view has proprioception like any observation. Paper: the visual pretraining that a large model
+brings along.
 """
 
 from __future__ import annotations
@@ -23,8 +25,10 @@ from interface.bodies import SIDES, Arm
 from robots.build_solver import robot_kit
 from sim.scene.catalogue import load_catalogue
 from sim.scene.compiler import BASE_JOINTS
+from sim.skills.body.body import Body
 from sim.skills.body.ready import ready_posture
-from sim.skills.obstacles import navigation_map
+from sim.skills.locomotion import best_stance
+from sim.skills.navigation import Stance
 from sim.tasks.drafts import NoDraft
 from sim.tasks.families import FAMILIES, draw
 from sim.tasks.sample import UNSEEN_TYPES, rng_for, scene_of
@@ -38,6 +42,10 @@ Array = NDArray[np.float64]
 _KEY_INSTANTS: Final = 7
 _FACING_SHARE: Final = 0.7
 _FACING_DISTANCE_M: Final = (0.3, 2.3)
+#: Share of poses before something, as after GoTo, with these bearings of it (degrees), and what they are off by (m, rad).
+_BEFORE_SHARE: Final = 0.5
+_BEARINGS_DEG: Final = (0.0, 0.0, -20.0, 20.0, -40.0, 40.0)
+_OFF: Final = (0.03, 0.08)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,22 +94,42 @@ def set_pose(world: World, pose: Pose) -> None:
     mujoco.mj_kinematics(world.model, world.data)
 
 
-def draw_pose(world: World, free: Array, rng: np.random.Generator) -> Pose:
-    """A free place, mostly facing something, any pelvis height, arms ready, as between actions, raised or anywhere."""
-    robot = world.robot
-    assert robot is not None
-    x, y = free[int(rng.integers(len(free)))]
-    yaw = float(rng.uniform(-np.pi, np.pi))
+def _place(body: Body, free: Array, rng: np.random.Generator) -> Stance:
+    """A free place: anywhere, mostly facing something, or before a thing where GoTo would bring the robot."""
+    world = body.world
+    x, y = map(float, free[int(rng.integers(len(free)))])
+    anywhere = Stance(x, y, float(rng.uniform(-np.pi, np.pi)))
+    names = list(world.objects)
+    movable = [name for name in names if world.objects[name].movable]
+    pool = movable if movable and rng.random() < 0.6 else names
+    name = pool[int(rng.integers(len(pool)))]
+    if rng.random() < _BEFORE_SHARE:
+        found = best_stance(
+            body.workspace.navigation(),
+            anywhere,
+            body.objects.interaction_point(name)[:2],
+            body.workspace.comfortable_distance_m(),
+            None,
+            float(np.deg2rad(rng.choice(_BEARINGS_DEG))),
+            body.objects.faces_rad(name),
+        )
+        if found is not None:
+            x, y = map(float, found[0].position + rng.normal(0.0, _OFF[0], 2))
+            return Stance(x, y, found[0].yaw_rad + float(rng.normal(0.0, _OFF[1])))
     if rng.random() < _FACING_SHARE:
-        names = list(world.objects)
-        movable = [name for name in names if world.objects[name].movable]
-        pool = movable if movable and rng.random() < 0.6 else names
-        target = world.poses.center(pool[int(rng.integers(len(pool)))])[:2]
+        target = world.poses.center(name)[:2]
         gaps = np.linalg.norm(free - target, axis=1)
         near = free[(gaps > _FACING_DISTANCE_M[0]) & (gaps < _FACING_DISTANCE_M[1])]
         if len(near):
-            x, y = near[int(rng.integers(len(near)))]
-            yaw = float(np.arctan2(target[1] - y, target[0] - x) + rng.normal(0.0, 0.3))
+            x, y = map(float, near[int(rng.integers(len(near)))])
+            return Stance(x, y, float(np.arctan2(target[1] - y, target[0] - x) + rng.normal(0.0, 0.3)))
+    return anywhere
+
+
+def draw_pose(body: Body, free: Array, rng: np.random.Generator) -> Pose:
+    """A place, any pelvis height, arms ready, as between actions, raised or anywhere."""
+    world, robot = body.world, body.spec
+    stance = _place(body, free, rng)
     low, high = robot.pelvis_height_range_m
     height = high if rng.random() < 0.3 else float(rng.uniform(low, high))
     joints: dict[str, float] = {}
@@ -118,7 +146,7 @@ def draw_pose(world: World, free: Array, rng: np.random.Generator) -> Pose:
         closed, opened = np.asarray(arm.hand_closed), np.asarray(arm.hand_open)
         joints |= dict(zip(arm.joints, map(float, posture), strict=True))
         joints |= dict(zip(arm.hand_joints, map(float, closed + opening * (opened - closed)), strict=True))
-    return Pose(float(x), float(y), yaw, height, joints)
+    return Pose(stance.x, stance.y, stance.yaw_rad, height, joints)
 
 
 def lead_in(world: World, before: Pose, pose: Pose, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -232,12 +260,12 @@ def views_of_part(config: CollectConfig, part: int) -> Iterator[dict[str, Any]]:
         index = start // config.views_per_world + part
         rng = rng_for("views", config.seed, start)
         world = _random_world(config, index, rng)
-        assert world.robot is not None
-        free = navigation_map(world, world.robot.footprint_radius_m).free_positions()
+        body = Body(world)
+        free = body.workspace.navigation().free_positions()
         renderer = Renderer(world.scene, config.image_size, config.image_size)
-        before = draw_pose(world, free, rng)
+        before = draw_pose(body, free, rng)
         for number in range(start, min(start + config.views_per_world, numbers.stop)):
-            pose = draw_pose(world, free, rng)
+            pose = draw_pose(body, free, rng)
             motion = lead_in(world, _nearby(before, pose, rng), pose, rng)
             view = renderer.view("head", depth=True, segmentation=True)
             yield view_row(world, view, motion, number)

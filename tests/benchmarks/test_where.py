@@ -46,7 +46,7 @@ def test_the_table_is_made_from_shards(tmp_path: Path, capsys: pytest.CaptureFix
     write_views(tmp_path / "views", 60)
     assert main([f"views={tmp_path / 'views'}"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert "asked about" in lines[0] and lines[1].split() == ["known", "side", "arm", "distance", "height", "shift"]
+    assert "asked about" in lines[0] and lines[1].split() == ["known", "side", "arm", "distance", "height", "reach", "shift"]
     assert [line[:24].strip() for line in lines[2:5]] == ["robot alone", "mrope", "rope_radial, reach"]
 
 

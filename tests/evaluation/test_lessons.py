@@ -89,7 +89,9 @@ def test_what_was_foreseen_is_the_answer_with_a_picture_and_never_in_words_alone
     reader = ShardReader(tmp_path, "demos")
     taught = [json.loads(text)["taught"] for text in reader.column("privileged")]
     targets = reader.column("target")
-    told = [_step(turn.answer) for episode in Lessons().told(tmp_path) for turn in episode.turns]
+    turns = [turn for episode in Lessons().told(tmp_path) for turn in episode.turns]
+    assert [turn.tries for turn in turns] == [any(one.spec.arms for one in PlanStep.parse(text).actions) for text in taught]
+    told = [_step(turn.answer) for turn in turns]
     assert told == [_step(answer_words("Pick", "", PlanStep.parse(target))) for target in targets]
     assert (targets != taught) == ahead
     assert reader.manifest.metadata["physics"] == PHYSICS

@@ -205,6 +205,20 @@ def test_body_shift_by_hand():
     assert questions.shift_answer(np.array([1.0, 0, -9.0]), bodies) == "MoveDown(1)"
 
 
+def test_an_arm_reaches_as_far_as_it_is_long_and_a_tenth_more():
+    bodies = np.zeros((14, 3))
+    for side, y in ((2, 0.2), (5, -0.2)):  # arms of 0.6 m, from shoulders at 0.5 m
+        bodies[side], bodies[side + 1], bodies[side + 2] = [0, y, 0.5], [0, y, 0.2], [0, y, -0.1]
+    answers = {
+        "both": (0.6, 0.0, 0.5),
+        "left": (0.6, 0.3, 0.5),
+        "right": (0.6, -0.3, 0.5),
+        "none": (0.7, 0.0, 0.5),
+    }
+    assert {name: questions.reach_answer(np.array(at), bodies) for name, at in answers.items()} == {one: one for one in answers}
+    assert questions.reach_answer(np.array([0.5, 0.0, 0.0]), bodies) == "none"  # too low
+
+
 def test_collator_refuses_what_does_not_fit(cfg, processor, examples):
     collate = Collator(processor, cfg, max_tokens=60)
     with pytest.raises(ValueError, match="at most 60"):

@@ -50,7 +50,7 @@ class _Told:
 
 
 def test_the_truth_is_the_simulators(asked: list[Question]) -> None:
-    assert {one.kind for one in asked} == {"side", "distance", "height", "arm", "hands", "pelvis"}
+    assert {one.kind for one in asked} == {"side", "distance", "height", "arm", "reach", "hands", "pelvis"}
     for one in asked:
         if one.kind == "pelvis":
             assert float(one.answer) == pytest.approx(one.row.motion[-1, PELVIS_HEIGHT], abs=0.026)
@@ -65,7 +65,7 @@ def test_scores_by_kind_and_of_all(asked: list[Question]) -> None:
         return ["left" if blind else one.answer for one in questions]
 
     found = scores(asked, answer, blind=True)
-    assert [one.kind for one in found] == ["side", "distance", "height", "arm", "hands", "pelvis", "all"]
+    assert [one.kind for one in found] == ["side", "distance", "height", "arm", "reach", "hands", "pelvis", "all"]
     assert all(one.right == one.asked for one in found) and found[-1].asked == len(asked) == sum(o.asked for o in found[:-1])
     assert found[0].blind == sum(one.answer == "left" for one in asked if one.kind == "side")
     assert found[-1].commonest == sum(one.commonest for one in found[:-1]) < len(asked)
@@ -90,6 +90,7 @@ def test_a_backend_is_shown_picture_and_body_or_neither(asked: list[Question]) -
     [
         ("side", "To the LEFT.", "left"),
         ("arm", "Either", "either"),
+        ("reach", "None of them.", "none"),
         ("hands", "Both hands", "left right"),
         ("hands", "none of them", "none"),
         ("pelvis", "about 0.87 m", "0.85"),

@@ -54,6 +54,19 @@ def test_a_turn_is_the_decision_of_its_row(trained: Pipeline) -> None:
         assert np.array_equal(example.views[0].image, demos.view(demos.reader[int(row)]).image)
 
 
+def test_tries_of_an_arm_are_drawn_more_often(trained: Pipeline) -> None:
+    model = load_model(trained.paths.model("base"))
+    turns = turns_of(trained, model, lessons_of(trained, model.cfg))
+    told = [turn for folder in lesson_folders(trained) for one in Lessons().told(folder) for turn in one.turns]
+    tries = dict(zip(sorted((*turns.train, *turns.test)), (turn.tries for turn in told), strict=True))
+    example, drawn = turns.example, list[int]()
+    turns.example = lambda row, read=0: drawn.append(row) or example(row, read)  # type: ignore[method-assign]
+    for seed in range(12):
+        turns.batch(np.random.default_rng(seed), 8)
+    there, asked = (np.mean([tries[row] for row in rows]) for rows in (turns.train, drawn))
+    assert 0.2 < there < 0.8 and asked > there + 0.5 * (3.0 * there / (1.0 + 2.0 * there) - there), (there, asked)
+
+
 @pytest.mark.parametrize("stage", ["base", "selu"])
 def test_decisions_beside_a_log_are_learnt_as_alone(trained: Pipeline, stage: str) -> None:
     model = load_model(trained.paths.model(stage), trainable=True).eval()

@@ -47,6 +47,15 @@ def test_views_are_complete(views):
         assert {item["type"] for item in json.loads(row["objects"])} == shown
 
 
+def test_half_of_the_views_are_where_an_arm_could_reach_something() -> None:
+    config = CollectConfig("views", "unused", 48, part_size=48, views_per_world=24, image_size=28)
+    nearest = [
+        min((np.hypot(*item["center_in_pelvis"][:2]) for item in json.loads(row["objects"])), default=9.0)
+        for row in rows_of_part(config, 0)
+    ]
+    assert 0.2 < np.mean(np.array(nearest) < 0.8) < 0.9, sorted(nearest)
+
+
 def test_depth_agrees_with_what_is_seen(views):
     """A visible object's centre, projected into the view, is at a depth near the pixels that show it."""
     checked = 0
