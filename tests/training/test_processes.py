@@ -110,4 +110,7 @@ def test_every_stage_runs_in_two_processes(shards: Path, tmp_path: Path) -> None
         metrics = [json.loads((root / "done.json").read_text())["metrics"] for root in (one, two)]
         assert set(metrics[0]) == set(metrics[1])
     one, two = (StagePaths(debug_config(folder)).model("words") / "vlm" / "model.safetensors" for folder in folders)
-    torch.testing.assert_close(load_file(one), load_file(two), atol=4e-3, rtol=1e-2)  # bfloat16, and Muon's orthogonal steps
+    weights, others = load_file(one), load_file(two)
+    for name, tensor in weights.items():  # Muon makes all directions long, those of rounding too
+        gap = (tensor - others[name]).float().abs()
+        assert float(gap.max()) < 1e-2 and float(gap.mean()) < 6e-4, (name, float(gap.max()), float(gap.mean()))
