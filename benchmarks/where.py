@@ -32,7 +32,7 @@ from interface.observation import Camera
 from proprio_mllm.model.building import load_model
 from proprio_mllm.model.geometry import centroid, project
 from proprio_mllm.model.mpe import relative_cells
-from proprio_mllm.model.questions import arm_answer, distance_answer, height_answer, reach_answer, shift_answer, side_answer
+from proprio_mllm.model.questions import ANSWERS
 from proprio_mllm.report.statistics import wilson
 from proprio_mllm.training.sources import Views, held_out, key_bodies_of
 
@@ -78,14 +78,7 @@ class Seen:
 
 def answers_about(point: NDArray[np.floating], bodies: NDArray[np.floating]) -> dict[str, str]:
     """Every question's answer about a point (3,) of the pelvis heading frame."""
-    return {
-        "side": side_answer(point),
-        "arm": arm_answer(point),
-        "distance": distance_answer(point),
-        "height": height_answer(point),
-        "reach": reach_answer(point, bodies),
-        "shift": shift_answer(point, bodies).partition("(")[0],
-    }
+    return {kind: answer(point, bodies).partition("(")[0] for kind, answer in ANSWERS.items()}
 
 
 def ids_of(cell: tuple[int, int], grid: int, camera: Camera, bodies: NDArray[np.float64]) -> dict[str, Ids]:

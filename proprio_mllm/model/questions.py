@@ -10,7 +10,7 @@ Frame: pelvis heading frame, x forward, y left, z up, metres. The bins are ours,
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final
 
 import numpy as np
@@ -118,3 +118,14 @@ def shift_answer(center: NDArray[np.floating], key_bodies: NDArray[np.floating])
     if shift == 0.0:
         return "none"
     return Action("MoveDown" if shift < 0 else "MoveUp", amount=round(min(abs(shift), 1.0), 3)).to_text()
+
+
+#: The true answer of each kind of question about an object, from its centre (3,) and the robot's own bodies (K, 3).
+ANSWERS: Final[Mapping[str, Callable[[NDArray[np.floating], NDArray[np.floating]], str]]] = {
+    "side": lambda center, _: side_answer(center),
+    "arm": lambda center, _: arm_answer(center),
+    "distance": lambda center, _: distance_answer(center),
+    "height": lambda center, _: height_answer(center),
+    "reach": reach_answer,
+    "shift": shift_answer,
+}

@@ -28,15 +28,7 @@ from proprio_mllm.model.batch import View
 from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, answers
-from proprio_mllm.model.questions import (
-    arm_answer,
-    ask,
-    distance_answer,
-    height_answer,
-    reach_answer,
-    shift_answer,
-    side_answer,
-)
+from proprio_mllm.model.questions import ANSWERS, ask
 
 #: One in this many views, episodes and clips is never trained on.
 HELD_OUT = 20
@@ -136,15 +128,7 @@ class Views:
         for obj in visible:
             centre = np.asarray(obj["center_in_pelvis"], dtype=np.float64)
             for kind in kinds:
-                answer = {
-                    "side": lambda c=centre: side_answer(c),
-                    "distance": lambda c=centre: distance_answer(c),
-                    "height": lambda c=centre: height_answer(c),
-                    "arm": lambda c=centre: arm_answer(c),
-                    "reach": lambda c=centre: reach_answer(c, bodies),
-                    "shift": lambda c=centre: shift_answer(c, bodies),
-                }[kind]()
-                found.append((ask(kind, str(obj["id"]), self.style), answer))
+                found.append((ask(kind, str(obj["id"]), self.style), ANSWERS[kind](centre, bodies)))
         order = rng.permutation(len(found))[:count]
         return [found[i] for i in order]
 

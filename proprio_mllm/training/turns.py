@@ -61,7 +61,7 @@ class Turns:
         self.codes = None if tokens is None else demos.tokens(tokens)
         self._told: dict[int, tuple[list[int], list[int], list[int]]] = {}
         names = demos.reader.column("episode")
-        self._weights = np.ones(len(names))
+        weights = np.ones(len(names))
         starts = [row for row, name in enumerate(names) if row == 0 or name != names[row - 1]]
         episodes = [episode for folder in folders for episode in told(folder)]
         for start, episode in zip(starts, episodes, strict=True):
@@ -71,13 +71,15 @@ class Turns:
                 if len(log) <= LONGEST_LOG * words.length:  # as in stage `words`
                     self._told[start + number] = (list(log), words.tokens(turn.now), words.tokens(turn.answer))
                 log += words.tokens(turn.taken)
-                self._weights[start + number] = _TRIED if turn.tries else 1.0
+                weights[start + number] = _TRIED if turn.tries else 1.0
         rows = np.array(sorted(self._told), dtype=np.int64)
         self.train, self.test = np.intersect1d(rows, demos.split.train), np.intersect1d(rows, demos.split.test)
         self._collator = Collator(model.processor, model.cfg)
         #: Training rows of each episode.
         ends = np.searchsorted(self.train, [*starts[1:], len(names)])
         self._episodes = [rows for rows in np.split(self.train, ends[:-1]) if len(rows)]
+        #: How often each of them is drawn, relative to the others.
+        self._weights = [weights[rows] for rows in self._episodes]
 
     def draw(self, rng: np.random.Generator, size: int) -> list[Example]:
         """Training decisions."""
@@ -85,12 +87,11 @@ class Turns:
 
     def batch(self, rng: np.random.Generator, episodes: int) -> tuple[Batch, ...]:
         """Training decisions of some episodes, longer ones more often, and tries of an arm, in parts of similar length."""
-        weights = [self._weights[rows] for rows in self._episodes]
-        shares = np.array([each.sum() for each in weights])
+        shares = np.array([weights.sum() for weights in self._weights])
         drawn: list[NDArray[np.int64]] = []
         for i in rng.choice(len(shares), episodes, p=shares / shares.sum()):
             rows = self._episodes[i]
-            drawn.append(np.sort(rng.choice(rows, TURNS, replace=len(rows) < TURNS, p=weights[i] / shares[i])))
+            drawn.append(np.sort(rng.choice(rows, TURNS, replace=len(rows) < TURNS, p=self._weights[i] / shares[i])))
         drawn.sort(key=lambda rows: len(self._told[rows[-1]][0]))
         parts: list[Batch] = []
         for some in (drawn[first : first + _EPISODES] for first in range(0, episodes, _EPISODES)):
