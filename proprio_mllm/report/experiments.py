@@ -18,7 +18,7 @@ from proprio_mllm.report.figures import distribution_figures, failure_figure
 from proprio_mllm.report.paper import PAPER_ROWS, paper_ablation, paper_main, paper_replanning
 from proprio_mllm.report.runs import newest
 from proprio_mllm.report.stored import Run, find_runs
-from proprio_mllm.report.table import Table, in_time_cell, rate_cell
+from proprio_mllm.report.table import Table, first_try_cell, in_time_cell, rate_cell
 
 _CATEGORIES: Final = ("essential", "optional", "single")
 _PAPER_NOTE: Final = "paper: printed in the paper, another simulator and a 7B model; not comparable in size, shown apart."
@@ -28,6 +28,8 @@ _PAPER_NOTE: Final = "paper: printed in the paper, another simulator and a 7B mo
 _Row = tuple[str | None, list[tuple[Run | None, str]]]
 #: Runs that a note names.
 _NAMED: Final = 6
+#: What a place's columns are: success, success in time, share of first tries in reach.
+_RATES: Final = ("", " in time", " first try %")
 _COSTS: Final = ("invalid %", "broken", "calls", "tokens", "USD", "model")
 
 
@@ -83,19 +85,19 @@ def _costs(shown: Sequence[Run]) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def _rates(run: Run | None, category: str) -> tuple[str, str]:
-    """Success and success in time; of a run that is not finished they say how many episodes there will be."""
+def _rates(run: Run | None, category: str) -> tuple[str, str, str]:
+    """Success, success in time, first tries; of a run that is not finished they say how many episodes there will be."""
     row = None if run is None else run.row(category)
     if run is None or row is None:
-        return "", ""
+        return "", "", ""
     planned = run.planned(category)
     rest = "" if row.episodes == planned else f" of {planned}"
-    return rate_cell(row) + rest, in_time_cell(row) + rest
+    return rate_cell(row) + rest, in_time_cell(row) + rest, first_try_cell(row)
 
 
 def _columns(places: Iterable[str]) -> list[str]:
     """Headings of `_rates` of each place."""
-    return [f"{place}{suffix}" for place in places for suffix in ("", " in time")]
+    return [f"{place}{suffix}" for place in places for suffix in _RATES]
 
 
 def _filled(rows: Sequence[_Row]) -> Sequence[_Row]:
@@ -131,7 +133,8 @@ def _own_row(title: str, cells: Sequence[tuple[Run | None, str]]) -> tuple[str, 
 
 def _paper_row(method: str, values: Mapping[Any, float], places: Sequence[Any]) -> tuple[str, ...]:
     """A row of the paper's figures; it names no costs."""
-    cells = (text for place in places for text in (f"{values[place]:.2f}" if place in values else "", ""))
+    rest = ("",) * (len(_RATES) - 1)
+    cells = (text for place in places for text in (f"{values[place]:.2f}" if place in values else "", *rest))
     return (method, "paper", *cells, *("",) * len(_COSTS))
 
 
@@ -155,8 +158,9 @@ def main_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
     columns = ("planner", "source", *_columns(f"{category} {robot}" for category, robot in places), *_COSTS)
     notes = (
         "ours: success within 50 steps, and within the task's own time limit (in time), in %, 95 % interval over tasks, "
-        "successes/episodes, `of N` in a run that is not finished. calls, tokens, USD: means per episode; invalid: share of "
-        "calls; broken: attempts that failed for reasons outside the planner, run again and not scored.",
+        "successes/episodes, `of N` in a run that is not finished; first try: share of first tries in reach. calls, "
+        "tokens, USD: means per episode; invalid: share of calls; broken: attempts that failed for reasons outside the "
+        "planner, run again and not scored.",
         _PAPER_NOTE,
         *_left_out(cfg, (difficulty,), cfg.robots, runs, shown),
     )
@@ -209,7 +213,7 @@ def ablation_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
         shown.append(run)
         row = None if run is None else run.row("essential")
         own = (
-            ("", "", "", "", "")
+            ("",) * 6
             if row is None
             else (*_rates(run, "essential"), *map(str, (row.navigation, row.body_adjustment, row.logical)))
         )
@@ -220,7 +224,7 @@ def ablation_table(cfg: ExperimentConfig, runs: Sequence[Run]) -> Table:
             printed = (f"{values['success_percent']:.2f}", *counts)
         body.append((_label(name), *own, *printed))
     kinds = ("success", "navigation", "body adj.", "logical")
-    columns = ("planner", "success", "in time", *kinds[1:], *(f"paper {kind}" for kind in kinds))
+    columns = ("planner", "success", "in time", "first try %", *kinds[1:], *(f"paper {kind}" for kind in kinds))
     left_out = _left_out(cfg, (difficulty,), (robot,), runs, shown)
     notes = ("The paper counts failures over 133 tasks x 50 trials.", _PAPER_NOTE, *left_out)
     return Table(f"Ablation, dual-arm essential, {robot}, {difficulty}", columns, tuple(body), notes)

@@ -133,6 +133,11 @@ def in_time_cell(row: Row) -> str:
     return _cell(row.in_time_rate, row.in_time_low, row.in_time_high, row.in_time, row.episodes)
 
 
+def first_try_cell(row: Row) -> str:
+    """Share of first tries in reach, in %; empty without one."""
+    return _number(100 * row.extras.first_try_rate)
+
+
 def _cell(rate: float, low: float, high: float, count: int, episodes: int) -> str:
     return f"{100 * rate:.1f} [{100 * low:.1f}, {100 * high:.1f}] {count}/{episodes}" if episodes else ""
 
@@ -165,7 +170,7 @@ def run_table(title: str, rows: Sequence[Row], notes: Sequence[str] = ()) -> Tab
             rate_cell(row),
             in_time_cell(row),
             _number(100 * row.extras.spl),
-            _number(100 * row.extras.first_try_rate),
+            first_try_cell(row),
             str(row.navigation),
             str(row.body_adjustment),
             str(row.logical),

@@ -251,12 +251,27 @@ def test_ablation_and_replanning(tmp_path, run) -> None:
     runs = find_runs(tmp_path)
     ablation = ablation_table(ExperimentConfig("ablation_table", ("proprio", "proprio_no_cse"), ("h1",)), runs)
     assert ablation.rows[0][1] != ""
-    assert ablation.rows[1][1:6] == ("", "", "", "", "")
-    assert ablation.rows[1][6:] == ("45.17", "2205", "902", "538")
+    assert set(ablation.rows[1][1:7]) == {""}
+    assert ablation.rows[1][7:] == ("45.17", "2205", "902", "538")
     again = replanning_table(ExperimentConfig("replanning_table", ("proprio",), ("h1",), ("easy", "medium", "hard")), runs)
-    assert again.columns[2:6] == ("easy", "easy in time", "medium", "medium in time")
-    assert all(again.rows[0][2:4]) and all(again.rows[0][6:8])
-    assert again.rows[0][4:6] == ("", "")
+    assert again.columns[2:6] == ("easy", "easy in time", "easy first try %", "medium")
+    assert all(again.rows[0][2:4]) and all(again.rows[0][8:10])
+    assert again.rows[0][5:8] == ("", "", "")
+
+
+def test_tables_tell_first_tries(tmp_path, record, store) -> None:
+    reached, far = (
+        ({"outcomes": [{"action": "Lift(Box_1)", "ok": not code, "code": code, "contingency": ""}]},) for code in ("", "TooFar")
+    )
+    folder = tmp_path / "eval" / "proprio-h1-easy"
+    folder.mkdir(parents=True)
+    tried = [record(f"t{n}", "essential", True, planner="proprio", trace=trace) for n, trace in enumerate((reached, far, ()))]
+    (run,) = [load_run(store(folder, tried))]
+    cfg = ExperimentConfig("main_table", ("proprio",), ("h1",), ("easy",))
+    for make in (main_table, replanning_table, ablation_table):
+        table = make(cfg, [run])
+        (column,) = [n for n, name in enumerate(table.columns) if name.endswith("first try %") and table.rows[0][n]]
+        assert table.rows[0][column] == "50.0"
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
