@@ -33,6 +33,7 @@ COMMANDS: Final = {
     "video": ("proprio_mllm.report.video", "one episode as a film: RUN TASK"),
     "replay": ("proprio_mllm.report.replay", "one episode again in the browser, step by step: RUN TASK"),
     "export": ("proprio_mllm.report.export", "runs as training rows or JSON lines: RUN ..."),
+    "curves": ("proprio_mllm.report.curves", "learning curves of training: FOLDER ..."),
     "tokenizers": ("proprio_mllm.report.tokenizer", "what motion tokenizers keep: TOKENIZER ..."),
     "reconstruction": (
         "proprio_mllm.report.reconstruction",

@@ -38,14 +38,14 @@ _COLUMN = 36
 _TOO_FLAT = 5.0
 
 
-def _figure(width: float, height: float, panels: int = 1) -> tuple[Figure, list[Axes]]:
+def new_figure(width: float, height: float, panels: int = 1, lines: int = 1) -> tuple[Figure, list[Axes]]:
+    """A figure, inches, and its panels line by line; it draws without a display."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(1, panels, squeeze=False)
-    return figure, list(axes[0])
+    return figure, list(figure.subplots(lines, panels, squeeze=False).flat)
 
 
-def _save(figure: Figure, path: Path, source: str) -> Path:
+def save_figure(figure: Figure, path: Path, source: str) -> Path:
     """Writes a figure with a line below it that says what it was made from."""
     width = int(figure.get_figwidth() * 17)
     figure.supxlabel(textwrap.fill(source, width), fontsize=7, color="#555555", x=0.01, ha="left")
@@ -116,12 +116,12 @@ def failure_figure(cfg: ExperimentConfig, runs: Sequence[Run], folder: Path) -> 
     """Failure types per planner, one panel per robot; planners without a run are left out."""
     shown = {robot: _shown(cfg, runs, robot) for robot in cfg.robots}
     width = 1.2 + _BAR_INCH * max(4, *(len(group) for group in shown.values()))
-    figure, panels = _figure(width * len(cfg.robots), 4.4, len(cfg.robots))
+    figure, panels = new_figure(width * len(cfg.robots), 4.4, len(cfg.robots))
     for axes, (robot, group) in zip(panels, shown.items(), strict=True):
         rows = [(str(run.metadata["label"]), row) for run in group if (row := run.row("all")) is not None]
         plot_failures(axes, rows, f"{robot.upper()}, {cfg.difficulties[0]}")
     used = [run for group in shown.values() for run in group]
-    return [_save(figure, folder / "failure_figure.png", f"Numbers: failed episodes. {_runs_source(used)}")]
+    return [save_figure(figure, folder / "failure_figure.png", f"Numbers: failed episodes. {_runs_source(used)}")]
 
 
 def _bars(
@@ -167,7 +167,7 @@ def task_distribution(tasks: Sequence[Task], path: Path) -> Path:
     each = max(math.ceil(len(types) / max(1, math.ceil(len(types) / _COLUMN))), 1)
     columns = [types[start : start + each] for start in range(0, len(types), each)] or [[]]
     lines = max(*(len(column) for column in columns), len(pairs), sum(len(counts) + 3 for counts in small.values()))
-    figure, panels = _figure(4.2 * (len(columns) + 2), 1.2 + _LINE_INCH * lines, len(columns) + 2)
+    figure, panels = new_figure(4.2 * (len(columns) + 2), 1.2 + _LINE_INCH * lines, len(columns) + 2)
     for number, column in enumerate(columns):
         title = "object types: tasks with one in a goal (dark), in the scene" if number == 0 else ""
         _bars(panels[number], column, scenes, title, wanted)
@@ -177,7 +177,7 @@ def task_distribution(tasks: Sequence[Task], path: Path) -> Path:
         axes.set_ylim(len(column) - 0.3 - lines, len(column) - 0.3)
     _stacked(panels[-1], small)
     digest = hashlib.sha256(tasks_text(list(tasks)).encode()).hexdigest()[:12]
-    return _save(figure, path, f"{len(tasks)} tasks of the benchmark, content {digest}; counts of tasks.")
+    return save_figure(figure, path, f"{len(tasks)} tasks of the benchmark, content {digest}; counts of tasks.")
 
 
 def _stacked(axes: Axes, groups: Mapping[str, Counter[str]]) -> None:
@@ -195,7 +195,7 @@ def distribution_figures(cfg: ExperimentConfig, runs: Sequence[Run], folder: Pat
     files = [task_distribution(load_benchmark(), folder / "task_distribution.png")]
     shown = {robot: _shown(cfg, runs, robot) for robot in cfg.robots}
     width = 1.2 + _BAR_INCH * max(4, *(len(group) for group in shown.values()))
-    figure, panels = _figure(width * len(cfg.robots), 4.2, len(cfg.robots))
+    figure, panels = new_figure(width * len(cfg.robots), 4.2, len(cfg.robots))
     for axes, (robot, group) in zip(panels, shown.items(), strict=True):
         won = [(run, [r.steps for r in run.records if r.outcome is Outcome.SUCCESS]) for run in group]
         won = [(run, steps) for run, steps in won if steps]
@@ -212,4 +212,4 @@ def distribution_figures(cfg: ExperimentConfig, runs: Sequence[Run], folder: Pat
             _say_empty(axes)
     used = [run for group in shown.values() for run in group]
     source = f"Box: quartiles; line: median; whiskers: 1.5 quartile ranges. {_runs_source(used)}"
-    return [*files, _save(figure, folder / "steps_distribution.png", source)]
+    return [*files, save_figure(figure, folder / "steps_distribution.png", source)]

@@ -44,8 +44,8 @@ def _tasks(types: int, families: int, count: int) -> list[Task]:
 def _drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     """Figures that are saved from now on."""
     saved: list[Figure] = []
-    save = figures._save
-    monkeypatch.setattr(figures, "_save", lambda figure, path, source: (saved.append(figure), save(figure, path, source))[1])
+    save = figures.save_figure
+    monkeypatch.setattr(figures, "save_figure", lambda figure, path, source: (saved.append(figure), save(figure, path, source))[1])
     return saved
 
 
