@@ -183,6 +183,7 @@ class SeluConfig:
         replay_share: share of the batches that is replayed against forgetting: for the actor decisions of lessons, for
             the critic judging questions.
         per_class: most kept trajectories per verb, robot and category.
+        precision: share of the critic's yes to held-out questions that must be right for its yes to count; 0 counts it always.
         rollouts: who runs them.
     """
 
@@ -194,10 +195,11 @@ class SeluConfig:
     truth: Literal["audit", "oracle"] = "audit"
     replay_share: float = 0.5
     per_class: int = 40
+    precision: float = 0.85
     rollouts: Execution = field(default_factory=Execution)
 
     def __post_init__(self) -> None:
-        _require_shares(self, "replay_share")
+        _require_shares(self, "replay_share", "precision")
         _require_positive(self, "rounds", "episodes", "per_class")
         require(self.temperature > 0.0, f"temperature {self.temperature} must be positive: exploration needs draws")
 

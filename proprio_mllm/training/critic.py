@@ -7,6 +7,7 @@ open are ours: judging every moment to cut a trajectory at its first success, dr
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,7 @@ import numpy as np
 from interface.actions import ActionKind
 from interface.sightings import Shown
 from interface.steps import Action, PlanStep
-from proprio_mllm.model.batch import Collator, Example
+from proprio_mllm.model.batch import Example
 from proprio_mllm.model.building import use_adapter
 from proprio_mllm.model.chat import Message
 from proprio_mllm.model.modeling import ProprioMLLM
@@ -26,7 +27,8 @@ from proprio_mllm.model.observing import EpisodeLog, pictured_turn
 from proprio_mllm.model.prompts import Style, answers, critic_prompt, self_ask_prompt, with_answer
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import answer_words, reflection_words
-from proprio_mllm.training.goals import Relabel, relabel, verbs_of
+from proprio_mllm.training.asking import replies
+from proprio_mllm.training.goals import VERBS, Relabel, relabel, verbs_of
 from proprio_mllm.training.judging import LOG_LENGTH
 from proprio_mllm.training.rollouts import Rollout
 
@@ -77,19 +79,20 @@ class ModelJudge(Judge):
 
     Args:
         model: the model; its active adapter is switched to the critic's for every call.
-        collator: makes the batches.
         adapter: name of the critic's adapter.
-        size: questions per forward pass.
     """
 
-    def __init__(self, model: ProprioMLLM, collator: Collator, adapter: str = "critic", size: int = 16) -> None:
-        self._model, self._collator, self._adapter, self._size = model, collator, adapter, size
+    def __init__(self, model: ProprioMLLM, adapter: str = "critic") -> None:
+        self._model, self._adapter = model, adapter
         self._style: Style = model.cfg.prompt
 
     def completed(self, queries: Sequence[tuple[Trajectory, int, str]]) -> list[bool]:
         """Greedy replies; anything but `yes` is no."""
-        examples = [Example(judge_prompt(t, at, goal, self._style), (t.rollout.view(at),)) for t, at, goal in queries]
-        return [reply.strip().lower().startswith("yes") for reply in self._reply(examples, 4)]
+        return self.agrees([Example(judge_prompt(t, at, goal, self._style), (t.rollout.view(at),)) for t, at, goal in queries])
+
+    def agrees(self, asked: Sequence[Example]) -> list[bool]:
+        """Whether it says yes to conversations that ask for it."""
+        return [reply.lower().startswith("yes") for reply in self._reply(asked, 4)]
 
     def ask(self, trajectory: Trajectory, relation: str) -> str:
         """Greedy reply to a self-asked question."""
@@ -97,14 +100,9 @@ class ModelJudge(Judge):
         example = Example(ask_prompt(trajectory, relation, self._style), (trajectory.rollout.view(at),))
         return self._reply([example], 24)[0]
 
-    def _reply(self, examples: Sequence[Example], tokens: int) -> list[str]:
-        self._model.eval()
-        use_adapter(self._model, self._adapter)
-        found: list[str] = []
-        for start in range(0, len(examples), self._size):
-            batch = self._collator(examples[start : start + self._size], generation=True).to(self._model.device)
-            found.extend(self._model.reply(batch, tokens))
-        return found
+    def _reply(self, asked: Sequence[Example], tokens: int) -> list[str]:
+        use_adapter(self._model.eval(), self._adapter)
+        return replies(self._model, asked, tokens)
 
 
 class OracleJudge(Judge):
@@ -124,9 +122,8 @@ class OracleJudge(Judge):
         found = self._goals.get((rollout.episode, goal))
         if found is None or rollout.relations is None:
             return None
-        names = {"place": "on {}", "lift": "lifted", "turn_on": "switched on", "turn_off": "switched off"}
-        names |= {"close": "closed", "open": "open", "pick": "held"}
-        return all(obj in rollout.relations.get(names[verb].format(place), ()) for verb, obj, place in found.parts)
+        held = rollout.relations
+        return all(obj in held.get(VERBS[verb].relation.format(place), ()) for verb, obj, place in found.parts)
 
     def ask(self, trajectory: Trajectory, relation: str) -> str:
         """The relation's objects at the end that the robot knows of."""
@@ -258,6 +255,13 @@ def _stays(rollout: Rollout, at: int) -> bool:
     """Whether a step only repeats the way to where the step before went."""
     before, now = rollout.moments[at - 1] if at else None, rollout.moments[at]
     return before is not None and before.ok and before.step == now.step and now.step.startswith("GoTo(")
+
+
+def precision(judge: ModelJudge, asked: Sequence[Example]) -> float:
+    """Of the yes of a critic to conversations with their answers, the share that is right; 0 when it never says yes."""
+    right = [one.messages[-1].text == "yes" for one in asked]
+    said = judge.agrees([dataclasses.replace(one, messages=one.messages[:-1]) for one in asked])
+    return float(np.mean([truth for truth, yes in zip(right, said, strict=True) if yes])) if any(said) else 0.0
 
 
 def audit(trajectories: Sequence[Trajectory], goals: Mapping[tuple[str, str], Relabel], judge: Judge) -> dict[str, float]:

@@ -40,21 +40,47 @@ def _verb(name: str, pattern: str, relation: str, sentence: str) -> Verb:
     return Verb(name, re.compile(pattern, re.IGNORECASE), relation, sentence)
 
 
-#: Verbs by name. An instruction may have several (one per sub-goal).
+#: Verbs by name. An instruction may have several (one per sub-goal); what is cooked a log does not tell, so none asks for it.
 VERBS: Final[Mapping[str, Verb]] = {
     verb.name: verb
     for verb in (
-        _verb("place", r"\b(put|place|move|bring|set|belongs?|goes|stow|store)\b", "on {}", "Put {a} {pr} {r}."),
+        _verb(
+            "place",
+            r"\b(put(?! some water)|place|move|bring|carry|set|stand|belongs?|goes?|stow|store)\b|\bthere should be\b",
+            "on {}",
+            "Put {a} {pr} {r}.",
+        ),
         _verb("lift", r"\blift\b|\b(both|two) hands\b", "lifted", "Lift {a}."),
-        _verb("turn_on", r"\b(turn|turning|switch|switching)\b.*?\bon\b|\brunning\b", "switched on", "Turn on {a}."),
-        _verb("turn_off", r"\b(turn|turning|switch|switching)\b.*?\boff\b|\bshould be off\b", "switched off", "Turn off {a}."),
-        _verb("close", r"\b(close|shut|closed)\b|\bnot stay open\b", "closed", "Close {a}."),
+        _verb(
+            "turn_on",
+            r"\b(turn|turning|switch|switching)\b.*?\bon\b|\brunning\b|\bsure that\b.*?\bon\b",
+            "switched on",
+            "Turn on {a}.",
+        ),
+        _verb(
+            "turn_off",
+            r"\b(turn|turning|switch|switching)\b.*?\boff\b|\bshould be off\b|\bsure that\b.*?\boff\b",
+            "switched off",
+            "Turn off {a}.",
+        ),
+        _verb("close", r"\b(close|closes|shut|closed)\b|\bnot stay open\b", "closed", "Close {a}."),
+        _verb("slice", r"\b(slice|cut)\b", "sliced", "Slice {a}."),
+        _verb("clean", r"\b(clean|wipe)\b", "clean", "Clean {a}."),
+        _verb("fill", r"\b(fill|filled|pour)\b|\bput some water\b|\bfull of water\b", "filled", "Fill {a}."),
+        _verb("use_up", r"\buse( it)? up\b|\bfinish\b|\ball that is left\b", "used up", "Use up {a}."),
         _verb("open", r"(?<!not stay )\bopen\b", "open", "Open {a}."),
-        _verb("pick", r"\b(pick|take|grab|get|hold of|in your hand)\b", "held", "Pick up {a}."),
+        _verb("pick", r"\b(pick|take|grab|get|hold|keep|fetch|in your hands?)\b", "held", "Pick up {a}."),
     )
 }
 #: Verbs that are only means when the first one is there: opening a fridge to put something in, picking to place.
-_MEANS: Final = (("place", "open"), ("place", "pick"), ("lift", "pick"), ("close", "open"))
+_MEANS: Final = (
+    ("place", "open"),
+    ("place", "pick"),
+    ("place", "lift"),
+    ("lift", "pick"),
+    ("close", "open"),
+    *((work, "pick") for work in ("slice", "clean", "fill", "use_up")),
+)
 
 
 def verbs_of(instruction: str) -> tuple[str, ...]:

@@ -7,7 +7,8 @@ read its inputs only.
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,21 +34,50 @@ def judge_example(demos: Demos, index: int, rng: np.random.Generator, tokens: ND
         rng: draws the question, and whether the end of another episode is asked about.
         tokens: motion tokens (rows, tokens) of all rows, None leaves proprioception out.
     """
-    style = demos.style
     ended = rng.random() < 0.6 and len(demos.finals) > 0
     if ended:
         index = int(rng.choice(demos.finals))
     row = demos.reader[int(index)]
     motion = None if tokens is None else tokens[int(index)].tolist()
-    history = history_of(row)
     if rng.random() < 0.5:
-        goal, done = row["instruction"], ended
-        if ended and rng.random() < 0.3:
-            other = demos.reader[int(rng.choice(demos.finals))]["instruction"]
-            done, goal = other == goal, other
-        prompt = critic_prompt(goal, row["visible"], history, motion, style, LOG_LENGTH)
-        return Example(with_answer(prompt, "yes" if done else "no"), (demos.view(row),))
+        return _completion_example(demos, row, ended, demos.finals, rng, motion)
+    history = history_of(row)
     states = states_from_log(history[-LOG_LENGTH:])
     relation = asked_relation(states, rng)
-    prompt = self_ask_prompt(relation, row["visible"], history, motion, style, LOG_LENGTH)
+    prompt = self_ask_prompt(relation, row["visible"], history, motion, demos.style, LOG_LENGTH)
     return Example(with_answer(prompt, answers(states[relation])), (demos.view(row),))
+
+
+def completion_examples(demos: Demos, count: int, tokens: NDArray[np.int64] | None) -> list[Example]:
+    """Held-out conversations whether a goal was completed, the same every time; half of them are at an episode's end.
+
+    Args:
+        demos: steps of lessons.
+        count: how many; none when nothing is held out.
+        tokens: motion tokens of all rows, or None.
+    """
+    rng, held_out = np.random.default_rng(0), demos.split.test
+    finals = np.intersect1d(demos.ends, held_out)
+    found: list[Example] = []
+    for ended in (rng.random(count if len(held_out) else 0) < 0.5) & (len(finals) > 0):
+        index = int(rng.choice(finals if ended else np.setdiff1d(held_out, finals)))
+        motion = None if tokens is None else tokens[index].tolist()
+        found.append(_completion_example(demos, demos.reader[index], bool(ended), finals, rng, motion))
+    return found
+
+
+def _completion_example(
+    demos: Demos,
+    row: Mapping[str, Any],
+    ended: bool,
+    finals: NDArray[np.int64],
+    rng: np.random.Generator,
+    motion: Sequence[int] | None,
+) -> Example:
+    """Whether a goal was completed; at the end of an episode the goal is another's now and then, drawn from `finals`."""
+    goal, done = row["instruction"], ended
+    if ended and rng.random() < 0.3:
+        other = demos.reader[int(rng.choice(finals))]["instruction"]
+        done, goal = other == goal, other
+    prompt = critic_prompt(goal, row["visible"], history_of(row), motion, demos.style, LOG_LENGTH)
+    return Example(with_answer(prompt, "yes" if done else "no"), (demos.view(row),))

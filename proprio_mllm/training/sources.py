@@ -171,9 +171,9 @@ class Demos:
         self.reader = _Joined([folder, *more])
         self.split = _Split(self.reader.column("episode"), folder)
         self.motions = np.stack([decode_motion(m) for m in self.reader.column("motion")])  # (N, T, F)
-        ends = np.flatnonzero(np.asarray(self.reader.column("target")) == "Done()")
-        #: Training rows at which the goals of an episode were met.
-        self.finals = np.intersect1d(ends, self.split.train)
+        #: Rows at which the goals of an episode were met, and those of them that are for training.
+        self.ends = np.flatnonzero(np.asarray(self.reader.column("target")) == "Done()")
+        self.finals = np.intersect1d(self.ends, self.split.train)
         self.style: Style = cfg.prompt
         labels = np.char.add(np.asarray(self.reader.column("category")), np.asarray(self.reader.folder_of(), dtype=str))
         labels = labels[self.split.train]

@@ -76,7 +76,9 @@ def test_observations_fit_every_planner_and_hide_the_world(cfg: EvalConfig) -> N
     report = session.goals()
     assert report.met == (False,)
     assert report.unmet_objects == {"Mug_1", "CoffeeTable_1"}, "what the goal names, and where it starts"
-    assert "Mug_1" in session.relations()["on CoffeeTable_1"]
+    relations = session.relations()
+    assert "Mug_1" in relations["on CoffeeTable_1"] and "Mug_1" in relations["clean"]
+    assert not {"sliced", "filled", "used up"} & relations.keys()
 
 
 def test_the_expert_is_privileged_and_needs_a_session() -> None:

@@ -45,7 +45,9 @@ def _drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     """Figures that are saved from now on."""
     saved: list[Figure] = []
     save = figures.save_figure
-    monkeypatch.setattr(figures, "save_figure", lambda figure, path, source: (saved.append(figure), save(figure, path, source))[1])
+    monkeypatch.setattr(
+        figures, "save_figure", lambda figure, path, source: (saved.append(figure), save(figure, path, source))[1]
+    )
     return saved
 
 

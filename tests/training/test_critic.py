@@ -16,12 +16,13 @@ from configs.schema.model import ModelConfig
 from configs.schema.train import TrainConfig
 from configs.validate import build
 from proprio_mllm.evaluation.lessons import Lessons
-from proprio_mllm.model.batch import Collator, Example
+from proprio_mllm.model.batch import Example
 from proprio_mllm.model.building import build_model, build_processor
+from proprio_mllm.model.chat import Message
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.word_tokens import add_word_tokens, known_words
 from proprio_mllm.model.wording import id_words, read_step
-from proprio_mllm.training import critic
+from proprio_mllm.training import asking, critic
 from proprio_mllm.training.critic import (
     Judge,
     Kept,
@@ -34,7 +35,7 @@ from proprio_mllm.training.critic import (
     keep,
 )
 from proprio_mllm.training.goals import Relabel
-from proprio_mllm.training.judging import judge_example
+from proprio_mllm.training.judging import completion_examples, judge_example
 from proprio_mllm.training.pipeline import base_model_config
 from proprio_mllm.training.rollouts import Moment, Rollout
 from proprio_mllm.training.sources import Demos
@@ -173,15 +174,34 @@ def test_the_model_answers_every_question_under_the_critics_adapter(monkeypatch:
         return [next(told) for _ in batch]
 
     monkeypatch.setattr(critic, "use_adapter", lambda model, name: adapters.append(name))
-    model = SimpleNamespace(cfg=SimpleNamespace(prompt="terse"), eval=lambda: None, device="cpu", reply=reply)
-    collator = cast(Collator, lambda examples, generation: Batch(examples))
-    judge = ModelJudge(cast(ProprioMLLM, model), collator, size=2)
+    monkeypatch.setattr(asking, "Collator", lambda processor, cfg: lambda examples, generation: Batch(examples))
+    monkeypatch.setattr(asking, "_BATCH", 2)
+    model = SimpleNamespace(cfg=SimpleNamespace(prompt="terse"), processor=None, device="cpu", reply=reply)
+    model.eval = lambda: model
+    judge = ModelJudge(cast(ProprioMLLM, model))
     whole = trajectory("b", PICK_PLATE, "Pick up the mug.", False)
     assert judge.completed([(whole, at, "Pick up the mug.") for at in range(5)]) == [True, False, True, False, False]
     assert [size for size, _ in sizes] == [2, 2, 1]
     assert judge.ask(whole, "held") == "Plate_1"
     assert sizes[-1][0] == 1 and sizes[-1][1] > sizes[0][1]  # ids are longer than a yes
     assert set(adapters) == {"critic"}
+
+
+def test_precision_is_of_the_yes_alone() -> None:
+    def told(*answers: str) -> list[Example]:
+        return [Example((Message("user", "?"), Message("assistant", answer))) for answer in answers]
+
+    class Said(ModelJudge):
+        def __init__(self, *said: bool) -> None:
+            self.said = list(said)
+
+        def agrees(self, asked: Sequence[Example]) -> list[bool]:
+            assert all(one.messages[-1].role == "user" for one in asked), "the answer is not shown"
+            return self.said
+
+    asked = told("yes", "no", "yes", "yes", "no")
+    assert critic.precision(Said(True, True, True, False, False), asked) == pytest.approx(2 / 3)
+    assert critic.precision(Said(*[False] * 5), asked) == 0.0
 
 
 def test_duplicates_and_caps() -> None:
@@ -229,3 +249,15 @@ def test_judging_exercises_have_both_answers(demos: Demos) -> None:
     assert any(reply.endswith("_1") for reply in replies)
     done = next(example for example in found if example.messages[-1].text == "yes")
     assert "Pick(left" in done.messages[1].text
+
+
+def test_held_out_questions_are_of_episodes_that_no_training_sees(demos: Demos) -> None:
+    asked, again = completion_examples(demos, 60, None), completion_examples(demos, 60, None)
+    assert [one.messages for one in asked] == [one.messages for one in again]
+    told = {one.messages[-1].text for one in asked}
+    assert told == {"yes", "no"}
+    rows = [demos.reader[int(index)] for index in demos.split.test]
+    views = {demos.view(row).image.tobytes() for row in rows}
+    assert all(one.views[0].image.tobytes() in views for one in asked)
+    done = {row["instruction"] for row in rows if row["target"] == "Done()"}
+    assert all(any(goal in one.messages[1].text for goal in done) for one in asked if one.messages[-1].text == "yes")

@@ -7,6 +7,7 @@ import pytest
 from interface.observation import HistoryItem
 from proprio_mllm.training.goals import natural_name, parse_ids, relabel, verbs_of
 from proprio_mllm.training.states import states_from_log
+from sim.tasks.instructions import TEMPLATES, wordings
 
 INVENTORY = ("Mug_1", "Plate_1", "CoffeeTable_1", "Fridge_1", "Lamp_1", "Lamp_2")
 
@@ -30,6 +31,32 @@ INVENTORY = ("Mug_1", "Plate_1", "CoffeeTable_1", "Fridge_1", "Lamp_1", "Lamp_2"
 )
 def test_verbs(instruction: str, verbs: tuple[str, ...]) -> None:
     assert verbs_of(instruction) == verbs
+
+
+#: The verbs of every family of tasks, the same in all of its wordings.
+FAMILIES = {
+    "pick": "pick", "place": "place", "open": "open", "close": "close", "toggle_on": "turn_on", "toggle_off": "turn_off",
+    "transport_two": "place", "transport_each": "place", "pick_and_toggle_on": "turn_on pick",
+    "pick_and_toggle_off": "turn_off pick", "pick_and_open": "open pick", "place_any": "place", "transport_any_two": "place",
+    "fill": "fill", "slice": "slice", "clean": "clean", "use_up": "use_up", "fetch_two": "place", "stow_two": "place",
+    "stow_two_close": "place close", "set_three": "place", "tidy_three": "place", "carry_level": "place",
+    "store_ajar": "place close", "fetch_ajar": "close pick", "slice_steady": "slice", "clean_steady": "clean",
+    "pour_hold": "fill", "toggle_both": "turn_on", "fetch": "place", "fetch_hold": "pick", "stow": "place",
+    "stow_close": "place close", "lift": "lift", "carry": "place", "hold_two": "pick", "carry_and_toggle": "place turn_on",
+    "carry_and_place": "place",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("family", sorted(set(TEMPLATES) - {"cook"}))  # a log does not tell what is cooked
+def test_every_wording_of_a_family_shows_its_verbs(family: str) -> None:
+    slots = {"a": "the mug", "b": "the lamp", "c": "the cup", "r": "the coffee table", "s": "the fridge", "n": "two mugs"}
+    for sentence in wordings(family, slots | {"pr": "on", "ps": "in", "on": "on"}):
+        assert verbs_of(sentence) == tuple(FAMILIES[family].split()), sentence
+
+
+def test_a_relabel_of_a_verb_of_tools() -> None:
+    found = relabel("Use the knife to slice the apple.", INVENTORY, (), {"sliced": "Mug_1"}.__getitem__)
+    assert found is not None and found.goal == "Slice the mug."
 
 
 def test_reply_is_checked_against_the_inventory() -> None:

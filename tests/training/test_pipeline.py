@@ -211,6 +211,25 @@ def test_the_critic_judges_unless_the_simulator_is_asked_to(
     assert judges == ["critic", "simulator"]
 
 
+@pytest.mark.parametrize(("right", "counts"), [(0.5, False), (0.9, True)])
+def test_a_critic_that_is_often_wrong_teaches_the_actor_nothing(
+    trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, right: float, counts: bool
+) -> None:
+    shutil.copytree(trained.cfg.output, tmp_path / "run")
+    monkeypatch.setattr(selu, "precision", lambda judge, asked: right)
+    monkeypatch.setattr(selu.ModelJudge, "completed", lambda self, asked: [at == t.rollout.length for t, at, _ in asked])
+    settings = dataclasses.replace(trained.cfg.selu, truth="audit", rounds=1)
+    cfg = dataclasses.replace(trained.cfg, output=str(tmp_path / "run"), selu=settings, overwrite=True)
+    told = Pipeline(STAGES, cfg, collect, "", correct, Lessons())
+    metrics = told.run("selu")
+    assert metrics is not None
+    assert metrics["round0_before_held_out_precision"] == metrics["round0_after_held_out_precision"] == right
+    assert (metrics["round0_kept"] > 0, metrics["round0_critic_direct"] > 0) == (counts, counts)
+    before, after = (load_model(told.paths.model(stage)).state_dict() for stage in ("alignment", "selu"))
+    moved = [name for name, tensor in before.items() if ".default" in name and not torch.equal(tensor, after[name])]
+    assert bool(moved) is counts
+
+
 def test_a_stage_that_is_stopped_is_not_finished(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not even under the configuration that had finished: the folder holds something else by now."""
     shutil.copytree(trained.cfg.output, tmp_path / "run")

@@ -2,10 +2,11 @@
 
 Actor and critic are two LoRA adapters over the stage-2 model: the actor goes on with stage 2's adapter, the critic starts as
 its copy. A round: roll the actor out with a temperature, judge every end, ask oneself and relabel failures keeping the verb,
-fine-tune the critic, judge again, fine-tune the actor on the kept trajectories. Before the first round the critic learns from
-questions about the expert's logs and about episodes in words. The critic's agreement with the simulator is reported and, unless
-`truth=oracle`, never used. Part of each batch is replayed against forgetting: demonstrations, and episodes in words in the
-proportion of stage 2; the abstract of SELU mentions no replay.
+fine-tune the critic, judge again, fine-tune the actor on the kept trajectories; where the critic's yes is too often wrong about
+held-out lessons (`selu.precision`), nothing is kept and the critic learns from lessons alone. Before the first round the critic
+learns from questions about the expert's logs and about episodes in words. The critic's agreement with the simulator is reported
+and, unless `truth=oracle`, never used. Part of each batch is replayed against forgetting: demonstrations, and episodes in words
+in the proportion of stage 2; the abstract of SELU mentions no replay.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import logging
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -30,7 +31,6 @@ from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.critic import (
-    Judge,
     ModelJudge,
     OracleJudge,
     Trajectory,
@@ -38,9 +38,10 @@ from proprio_mllm.training.critic import (
     audit,
     critic_examples,
     keep,
+    precision,
 )
 from proprio_mllm.training.goals import Relabel
-from proprio_mllm.training.judging import judge_example
+from proprio_mllm.training.judging import completion_examples, judge_example
 from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.pipeline import Metrics, Pipeline
@@ -52,6 +53,8 @@ logger = logging.getLogger(__name__)
 
 #: Adapter names; the actor's is the one that stage 2 trained.
 ACTOR, CRITIC = "default", "critic"
+#: Held-out questions that tell the critic's precision, whether a goal was completed; half of them at the end of an episode.
+_ASKED: Final = 200
 
 
 class ExampleObjective(Objective):
@@ -153,9 +156,13 @@ class _Learner:
         self._demos = lessons_of(pipeline, self.model.cfg)
         self._turns = turns_of(pipeline, self.model, self._demos, self.tokenizer)
 
-    def judge(self) -> Judge:
+    def judge(self) -> ModelJudge:
         """The critic."""
-        return ModelJudge(self.model, Collator(self.model.processor, self.model.cfg), CRITIC)
+        return ModelJudge(self.model, CRITIC)
+
+    def precision(self) -> float:
+        """How often the critic is right when it says yes to held-out questions about lessons."""
+        return precision(self.judge(), completion_examples(self._demos, _ASKED, self._turns.codes))
 
     def _judging(self, rng: np.random.Generator) -> Example:
         return judge_example(self._demos, int(self._demos.draw(rng, 1)[0]), rng, self._turns.codes)
@@ -213,11 +220,11 @@ class _Selu:
         goals: dict[tuple[str, str], Relabel] = {}
         judge = OracleJudge(goals) if cfg.truth == "oracle" else learner.judge()
         metrics: dict[str, float] = {f"before_{name}": value for name, value in audit(trajectories, {}, judge).items()}
-        learnt = critic_examples(trajectories, judge, style, goals)
+        learnt = critic_examples(trajectories, judge, style, goals) if self._counts(learner, metrics, "before") else []
         for kind in ("direct", "relabel", "negative"):
             metrics[f"critic_{kind}"] = float(sum(one.kind == kind for one in learnt))
         learner.tune(CRITIC, "selu/critic", [one.example for one in learnt], cfg.critic, cfg.replay_share, folder / "critic")
-        kept = keep(trajectories, goals, judge, cfg.per_class)
+        kept = keep(trajectories, goals, judge, cfg.per_class) if self._counts(learner, metrics, "after") else []
         metrics |= {f"after_{name}": value for name, value in audit(trajectories, goals, judge).items()}
         steps = actor_examples(learner.model, kept)
         metrics |= {
@@ -227,10 +234,24 @@ class _Selu:
             "kept_relabelled": float(sum(item.relabelled for item in kept)),
             "actor_steps": float(len(steps)),
         }
-        learner.tune(ACTOR, "selu/actor", steps, cfg.actor, cfg.replay_share, folder / "actor")
+        if steps:
+            learner.tune(ACTOR, "selu/actor", steps, cfg.actor, cfg.replay_share, folder / "actor")
         learner.store(folder / "model")
         first_alone(lambda: finish(folder, key, metrics))
         return metrics
+
+    def _counts(self, learner: _Learner, metrics: dict[str, float], when: str) -> bool:
+        """Whether the judge's yes counts: the simulator's always, the critic's from `selu.precision` on."""
+        if self.cfg.truth == "oracle":
+            return True
+        metrics[f"{when}_held_out_precision"] = found = learner.precision()
+        if found < self.cfg.precision:
+            logger.warning(
+                "selu: the critic's yes to held-out questions is right in %.2f of cases, below selu.precision=%.2f: not used",
+                found,
+                self.cfg.precision,
+            )
+        return found >= self.cfg.precision
 
 
 class SeluStage:
@@ -239,7 +260,7 @@ class SeluStage:
     name = "selu"
     needs = ("alignment",)
     shards = ()
-    recipe = 5
+    recipe = 6
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The rounds, whoever runs the episodes."""
