@@ -1,7 +1,7 @@
-"""Keeps what docs/benchmark.md says of runs, as files beside it: `python -m tools.publish RUN [RUN …] [into=FOLDER]`.
+"""Keeps what docs/benchmark.md says of runs, as files beside it: `python -m tools.publish RUN [RUN …]`.
 
-`docs/results/NAME.json` (or `FOLDER/NAME.json` below it, for runs of another physics) holds a run's command, physics, weights
-and rows, and task by task whether it was solved and in time. Tests hold the figures of README.md and docs/benchmark.md against
+`docs/results/NAME.json` holds a run's command, physics, weights and rows, and task by task whether it was solved and in time; a
+folder below it, those of an older physics. Tests hold the figures of README.md and docs/benchmark.md against
 these files, and `make reproduce` holds a rerun against them.
 """
 
@@ -47,28 +47,22 @@ def published(run: Run) -> dict[str, Any]:
     }
 
 
-def results(into: str = ".") -> dict[str, dict[str, Any]]:
-    """All that is published in a folder, by name."""
-    return {path.stem: read_json(path) for path in sorted((FOLDER / into).glob("*.json"))}
+def results(folder: str = ".") -> dict[str, dict[str, Any]]:
+    """All that is published in a folder below `docs/results`, by name."""
+    return {path.stem: read_json(path) for path in sorted((FOLDER / folder).glob("*.json"))}
 
 
 @dataclass(frozen=True)
 class Options:
-    """Command line.
-
-    Attributes:
-        into: folder below `docs/results`.
-    """
-
-    into: str = "."
+    """It takes nothing besides the runs."""
 
 
 @command(ValueError, OSError)
 def main(arguments: Sequence[str]) -> int:
     """Publishes runs under their folders' names without the hash."""
-    folders, options = read_named(Options, arguments, ("RUN",), more=True)
+    folders, _ = read_named(Options, arguments, ("RUN",), more=True)
     for folder in map(Path, folders):
-        target = FOLDER / options.into / f"{folder.resolve().name.rpartition('-')[0]}.json"
+        target = FOLDER / f"{folder.resolve().name.rpartition('-')[0]}.json"
         write_text(target, json.dumps(published(load_run(folder)), indent=1) + "\n")
         sys.stdout.write(f"{target}\n")
     return 0
