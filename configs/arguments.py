@@ -31,6 +31,11 @@ EXTRAS: Final = {
 T = TypeVar("T")
 
 
+@dataclasses.dataclass(frozen=True)
+class NoOptions:
+    """Of a tool that takes names and nothing besides."""
+
+
 def command(*errors: type[Exception]) -> Callable[[Callable[[Sequence[str]], int]], Callable[[Sequence[str]], int]]:
     """Decorates a tool's `main`: a ConfigError, or one of `errors`, is printed and ends it with exit code 2."""
 

@@ -10,11 +10,10 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from configs.arguments import command, read_named
+from configs.arguments import NoOptions, command, read_named
 from data.files import read_json, write_text
 from interface.episode import Outcome
 from proprio_mllm.report.references import references_of
@@ -52,15 +51,10 @@ def results(folder: str = ".") -> dict[str, dict[str, Any]]:
     return {path.stem: read_json(path) for path in sorted((FOLDER / folder).glob("*.json"))}
 
 
-@dataclass(frozen=True)
-class Options:
-    """It takes nothing besides the runs."""
-
-
 @command(ValueError, OSError)
 def main(arguments: Sequence[str]) -> int:
     """Publishes runs under their folders' names without the hash."""
-    folders, _ = read_named(Options, arguments, ("RUN",), more=True)
+    folders, _ = read_named(NoOptions, arguments, ("RUN",), more=True)
     for folder in map(Path, folders):
         target = FOLDER / f"{folder.resolve().name.rpartition('-')[0]}.json"
         write_text(target, json.dumps(published(load_run(folder)), indent=1) + "\n")

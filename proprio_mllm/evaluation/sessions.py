@@ -68,9 +68,11 @@ class SimSession:
                 found["open" if item.open else "closed"].append(name)
             if item.can.toggleable:
                 found["switched on" if item.on else "switched off"].append(name)
-            states = {"sliced": item.sliced, "clean": not item.dirty, "filled": item.filled, "used up": item.used_up}
-            for state in (state for state, holds in states.items() if holds):
-                found[state].append(name)
+            for state, holds in (
+                ("sliced", item.sliced), ("clean", not item.dirty), ("filled", item.filled), ("used up", item.used_up),
+            ):  # fmt: skip
+                if holds:
+                    found[state].append(name)
             for carrier in item.carriers:
                 found[f"on {carrier}"].append(name)
         return dict(found)

@@ -15,7 +15,7 @@ from typing import Final
 
 from rich.console import Console
 
-from configs.arguments import dispatch, read_named
+from configs.arguments import NoOptions, dispatch, read_named
 from configs.schema.checks import require
 from data.files import write_text
 from proprio_mllm.report.comparison import RunComparison, compare_bodies, compare_runs, comparison_table
@@ -68,11 +68,6 @@ class PairOptions:
         require(not self.out or Path(self.out).suffix in endings, f"out={self.out}: endings are {', '.join(endings)}")
 
 
-@dataclass(frozen=True)
-class WriteOptions:
-    """`write` takes nothing besides the run."""
-
-
 def _text(result: RunComparison, suffix: str) -> str:
     if suffix == ".json":
         return json.dumps(result.to_json(), indent=1, ensure_ascii=False) + "\n"
@@ -99,7 +94,7 @@ def main(arguments: Sequence[str]) -> int:
         return dispatch("python -m proprio_mllm report", COMMANDS, arguments)
     try:
         if command == "write":
-            (run,), _ = read_named(WriteOptions, rest, ("RUN",))
+            (run,), _ = read_named(NoOptions, rest, ("RUN",))
             write_report(load_run(Path(run))).show()
         else:
             _pair(command, rest)

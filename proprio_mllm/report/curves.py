@@ -7,6 +7,7 @@ answers, in percent of its own axis. A row of the file is the mean since the row
 from __future__ import annotations
 
 import csv
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -64,7 +65,7 @@ def draw_curves(loops: Mapping[str, Mapping[str, NDArray[np.float64]]], path: Pa
         axes.set_title(title, fontsize=9)
         axes.set_xlabel("step", fontsize=8)
         axes.set_ylabel("loss", fontsize=8)
-        axes.set_ylim(0, 1.05 * float(np.nanpercentile(columns["loss"], 98)))
+        axes.set_ylim(0, 1.05 * float(np.percentile(columns["loss"], 98)))
         share.set_ylim(0, 100)
         share.set_ylabel("right, %", fontsize=8)
         axes.tick_params(labelsize=7)
@@ -85,14 +86,22 @@ class CurvesConfig:
     out: str = "outputs/look/curves.png"
 
 
+def _title(loop: Path, whole: Path) -> str:
+    """A loop's place below the folder that holds all of them; that folder's name for itself."""
+    name = loop.relative_to(whole)
+    name = name.parent if name.name == "loop" else name
+    return str(name) if name.parts else whole.name
+
+
 @command(ValueError, OSError)
 def main(arguments: Sequence[str]) -> int:
     """Command line; 0 on success, 2 on wrong arguments or without metrics."""
     folders, config = read_named(CurvesConfig, arguments, ("FOLDER",), more=True)
-    found = {path: path.relative_to(folder).parent for folder in folders for path in sorted(Path(folder).rglob("metrics.csv"))}
+    found = [path for folder in folders for path in sorted(Path(folder).rglob("metrics.csv"))]
     if not found:
         raise ValueError(f"{', '.join(folders)}: no metrics.csv here; expected a folder of training, for example outputs/tiny")
-    loops = {str(name.parent if name.name == "loop" else name): read_metrics(path) for path, name in found.items()}
+    whole = Path(os.path.commonpath([Path(folder).resolve() for folder in folders]))
+    loops = {_title(path.resolve().parent, whole): read_metrics(path) for path in found}
     out = Path(config.out)
     out.parent.mkdir(parents=True, exist_ok=True)
     sys.stdout.write(f"{draw_curves(loops, out)}\n")

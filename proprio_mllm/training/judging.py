@@ -57,10 +57,10 @@ def completion_examples(demos: Demos, count: int, tokens: NDArray[np.int64] | No
         tokens: motion tokens of all rows, or None.
     """
     rng, held_out = np.random.default_rng(0), demos.split.test
-    finals = np.intersect1d(demos.ends, held_out)
+    finals, others = np.intersect1d(demos.ends, held_out), np.setdiff1d(held_out, demos.ends)
     found: list[Example] = []
     for ended in (rng.random(count if len(held_out) else 0) < 0.5) & (len(finals) > 0):
-        index = int(rng.choice(finals if ended else np.setdiff1d(held_out, finals)))
+        index = int(rng.choice(finals if ended else others))
         motion = None if tokens is None else tokens[index].tolist()
         found.append(_completion_example(demos, demos.reader[index], bool(ended), finals, rng, motion))
     return found

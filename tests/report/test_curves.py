@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,16 @@ def test_a_panel_for_every_loop(training: Path, monkeypatch: pytest.MonkeyPatch,
     assert (training / "a" / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert list(drawn) == ["full/alignment/text", "shared/words"]
     np.testing.assert_array_equal(drawn["shared/words"]["exact"], [np.nan, 0.25, 0.75])
+
+
+def test_loops_are_told_apart_and_named(training: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    for name in ("a", "b"):
+        shutil.copytree(training / "shared", training / "seeds" / name)
+    drawn = []
+    monkeypatch.setattr("proprio_mllm.report.curves.draw_curves", lambda loops, path: drawn.append(list(loops)) or path)
+    for folders in (["seeds/a", "seeds/b"], ["shared/words"], ["shared/words/loop"]):
+        assert main([*(str(training / folder) for folder in folders), f"out={training / 'x.png'}"]) == 0
+    assert drawn == [["a/words", "b/words"], ["words"], ["loop"]]
 
 
 def test_a_share_is_drawn_in_percent_and_where_it_is_known(training: Path, monkeypatch: pytest.MonkeyPatch) -> None:
