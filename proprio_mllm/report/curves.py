@@ -70,8 +70,9 @@ def draw_curves(loops: Mapping[str, Mapping[str, NDArray[np.float64]]], path: Pa
         share.set_ylabel("right, %", fontsize=8)
         axes.tick_params(labelsize=7)
         share.tick_params(labelsize=7)
+        share.set_visible(bool(share.lines))
         handles = [handle for one in (axes, share) for handle in one.get_legend_handles_labels()[0]]
-        share.legend(handles=handles, fontsize=7, frameon=False, loc="center right")
+        axes.legend(handles=handles, fontsize=7, frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.2))
     return save_figure(figure, path, "Loss and share of right answers on batches as they were trained, means between logs.")
 
 
