@@ -142,11 +142,11 @@ class PracticeConfig:
 
 @dataclass(frozen=True)
 class AlignmentConfig:
-    """`stage=alignment`: two frozen phases, then the joint one.
+    """`stage=alignment`: motion with text, then with images, then all together.
 
     Attributes:
         text: loop of phase 2a-i, motion and text; vision and CSE frozen.
-        image: loop of phase 2a-ii, motion and image; the language model's LoRA frozen.
+        image: loop of phase 2a-ii, motion and image; vision frozen.
         joint: loop of phase 2b; rows, LoRA, CSE and merger train.
         plan_share: share of the joint batches that are of episodes: decisions with pictures and motion, episodes in words.
         text_share: share of episodes in words among them.

@@ -3,16 +3,18 @@
 | phase | pairs | trains | frozen |
 |---|---|---|---|
 | text (2a-i) | motion to text, to body state and back, masked motion, replay | motion rows, LoRA | vision, merger, CSE |
-| image (2a-ii) | motion and image to text | motion rows, CSE, MPE | language model's LoRA, vision |
+| image (2a-ii) | motion and image to text, replay | motion rows, LoRA, CSE, MPE | vision, merger |
 | joint (2b) | all of them | motion rows, LoRA, CSE, MPE, merger | vision, backbone |
 
-"Freeze the image and text weights separately" leaves open which weights; this reading freezes one modality's while the
-other's pairs train. Besides clip captions, motion and image to text holds questions about the robot's own body in its scene
-(which arm reaches an object, how far the body must go down), and motion to text asks which hands are open and how high the
-pelvis is, which captions do not say and planning needs. Wherever LoRA trains, a share of decisions, with motion tokens before
-their answers, and of episodes in words keeps what was learnt before; the paper does not mention any such replay.
+"Freeze the image and text weights separately" leaves open which weights; in this reading the vision tower stays as it is while
+motion meets text, and while motion and CSE meet images. LoRA trains throughout: what CSE adds to a visual token is of no use
+before the language model looks the token up by the object's name, which CSE alone cannot teach it. Besides clip captions,
+motion and image to text holds questions about the robot's own body in its scene (which arm reaches an object, how far the body
+must go down), and motion to text asks which hands are open and how high the pelvis is, which captions do not say and planning
+needs. Wherever LoRA trains, a share of decisions, with motion tokens before their answers, and of episodes in words keeps what
+was learnt before; the paper does not mention any such replay.
 
-The control `variant=no_proprio` has the joint phase alone, and of its pairs those that need no motion.
+The control `variant=no_proprio` has no text phase, and of the others' pairs those that need no motion.
 """
 
 from __future__ import annotations
@@ -54,10 +56,10 @@ class Phase:
 
 PHASES: Final[Mapping[str, Phase]] = {
     "text": Phase(("rows", "lora"), ("say", "feel", "feel", "feel", "do", "fill", "plan")),
-    "image": Phase(("rows", "cse", "mpe"), ("say_image", "body")),
+    "image": Phase(("rows", "lora", "cse", "mpe"), ("say_image", "body", "body", "body", "body", "plan")),
     "joint": Phase(
         ("rows", "lora", "cse", "mpe", "merger"),
-        ("say", "feel", "feel", "do", "fill", "say_image", "body", "body", "body", "plan"),
+        ("say", "feel", "feel", "do", "fill", "say_image", "body", "body", "body", "body", "body", "body", "plan"),
     ),
 }
 

@@ -33,7 +33,7 @@ class AlignmentStage:
     name = "alignment"
     needs = ("base", "practice", "pointmap", "tokenizer")
     shards = ("lessons",)
-    recipe = 10
+    recipe = 11
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The phases and the variant's model."""
@@ -50,8 +50,8 @@ class AlignmentStage:
         demos = lessons_of(pipeline, model.cfg)
         turns, words = turns_of(pipeline, model, demos, read), episodes_in_words(pipeline, model, f"{key}/words")
         data = AlignmentData(model, tokenizer, clips, views, demos, turns, words, pipeline.cfg.alignment)
-        # without proprioception there is nothing to align apart
-        wanted = PHASES if model.cfg.proprioception else ("joint",)
+        # without proprioception there is no motion to align with text
+        wanted = [phase for phase in PHASES if model.cfg.proprioception or phase != "text"]
         loops = {phase: getattr(pipeline.cfg.alignment, phase) for phase in wanted}
         for phase, loop in loops.items():
             train_only(model, PHASES[phase].groups)
