@@ -248,6 +248,8 @@ class TrainConfig:
         practice: `stage=practice`.
         output: folder of all outputs.
         seed: seed of data order, initial weights and rollouts.
+        shared_seed: seed of the stages before alignment, whose output is there; alignment or selu then runs with `seed`, in a
+            folder of its own. None: `seed`.
         threads: torch threads; 0 leaves torch's choice.
         micro_batches: into how many each step's batch is cut, to save memory or to be shared by processes; a multiple of these.
         recompute: whether the backbone's activations are computed again in the backward pass instead of being kept.
@@ -276,6 +278,7 @@ class TrainConfig:
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     output: str = "outputs"
     seed: int = 0
+    shared_seed: int | None = None
     threads: int = 2
     micro_batches: int = 1
     recompute: bool = False
@@ -288,6 +291,10 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         require(0 <= self.seed <= LARGEST_SEED, f"seed {self.seed} outside [0, {LARGEST_SEED}]")
+        require(
+            self.shared_seed is None or (0 <= self.shared_seed <= LARGEST_SEED and self.stage in ("alignment", "selu")),
+            f"shared_seed {self.shared_seed} with stage={self.stage}: allowed is up to {LARGEST_SEED}, with alignment or selu",
+        )
         require(
             self.footprint is None or self.footprint > 0.0, f"footprint {self.footprint} must be positive: TFLOP/s of a GPU"
         )

@@ -2,7 +2,7 @@
 
     <output>/<model>/data/{clips,views,lessons,practice}   shards, shared by all variants
     <output>/<model>/shared/{words,practice,base,pointmap,tokenizer}
-    <output>/<model>/<variant>/{alignment,selu}
+    <output>/<model>/<variant>/{alignment,selu}            <variant>-<seed> over shared stages of another seed
 
 A finished stage writes `done.json` with its key (hash of configuration and inputs) and its metrics; the stage is current while
 the key is the one that the present configuration and inputs give.
@@ -28,7 +28,9 @@ class StagePaths:
 
     def __init__(self, cfg: TrainConfig) -> None:
         self.root = Path(cfg.output) / cfg.model.name
-        self.variant = cfg.variant
+        own = cfg.shared_seed is None or cfg.shared_seed == cfg.seed
+        self.variant = cfg.variant if own else f"{cfg.variant}-{cfg.seed}"
+        self._seeds = cfg.seed, cfg.seed if cfg.shared_seed is None else cfg.shared_seed
 
     def shards(self, kind: str) -> Path:
         """Folder of shards: `views`, `demos` …; docs/data.md lists them."""
@@ -37,6 +39,10 @@ class StagePaths:
     def stage(self, name: str) -> Path:
         """Folder of a training stage's output."""
         return self.root / ("shared" if name in _SHARED else self.variant) / name
+
+    def seed(self, name: str) -> int:
+        """Seed of a training stage."""
+        return self._seeds[name in _SHARED]
 
     def model(self, name: str) -> Path:
         """The model folder that a stage leaves behind."""

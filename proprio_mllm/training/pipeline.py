@@ -167,7 +167,7 @@ class Pipeline:
         inputs = {needed: self.key(needed) for needed in stage.needs}
         inputs |= {kind: shard_hash(self.paths.shards(kind)) for kind in stage.shards}
         own = {"recipe": stage.recipe, "micro_batches": self.cfg.micro_batches, "keep_spatial": self.cfg.keep_spatial}
-        return stage_key(dict(stage.settings(self)) | own, self.cfg.seed, inputs)
+        return stage_key(dict(stage.settings(self)) | own, self.paths.seed(name), inputs)
 
     def ancestors(self, name: str) -> tuple[str, ...]:
         """A stage and everything that went into its output, in the order in which they run."""

@@ -20,6 +20,7 @@ from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.building import add_adapter, load_model
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.model.tensors import read_tensors
 from proprio_mllm.training import release
 from proprio_mllm.training.alignment import PHASES, AlignmentObjective
 from proprio_mllm.training.pipeline import Pipeline, StageError, variant_model
@@ -103,6 +104,18 @@ def test_the_control_trains_without_motion(trained: Pipeline) -> None:
     assert not (control.paths.model("selu") / "motion").exists()
     phases = {path.name for path in control.paths.stage("alignment").iterdir() if path.is_dir()}
     assert phases == {"image", "joint", "model"}
+
+
+def test_another_seed_of_alignment_goes_on_from_the_shared_stages(trained: Pipeline) -> None:
+    cfg = dataclasses.replace(trained.cfg, stage="alignment", seed=7, shared_seed=trained.cfg.seed)
+    other = Pipeline(STAGES, cfg, collect, lessons=Lessons())
+    assert other.is_current("base") and other.key("base") == trained.key("base")
+    assert other.key("alignment") != trained.key("alignment")
+    assert other.run("alignment") is not None and trained.is_current("alignment")
+    weights = [read_tensors(p.paths.model("alignment") / "heads.safetensors") for p in (trained, other)]
+    assert any(not torch.equal(weights[0][name], weights[1][name]) for name in weights[0] if name.startswith("cse"))
+    with pytest.raises(ValueError, match="shared_seed 0 with stage=base"):
+        dataclasses.replace(trained.cfg, stage="base", shared_seed=0)
 
 
 def test_oracle_selu_keeps_the_success_and_relabels_the_failure(trained: Pipeline) -> None:
