@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
+
+#: Rooms of training tasks and views: of every kind one room is kept back.
+TRAIN_ROOMS: Final = ("kitchen_1", "kitchen_2", "living_room_1", "living_room_2", "bedroom_1", "bathroom_1")
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class CollectConfig:
     out: str
     count: int
     robots: tuple[str, ...] = ("h1", "x1")
-    rooms: tuple[str, ...] = ("kitchen_1", "living_room_1")
+    rooms: tuple[str, ...] = TRAIN_ROOMS
     seed: int = 0
     image_size: int = 112
     part_size: int = 240

@@ -21,6 +21,7 @@ from typing import Final
 
 import numpy as np
 
+from configs.schema.collect import TRAIN_ROOMS
 from data.shards import ShardReader
 from interface.actions import ACTIONS
 from interface.bodies import PAPER_ROBOTS
@@ -51,7 +52,7 @@ from sim.collection.text_tasks import draw_task
 from sim.collection.text_world import TextWorld, feedback_text
 from sim.scene.catalogue import load_catalogue
 from sim.tasks.instructions import ORDINALS, TEMPLATES, natural_name, plural
-from sim.tasks.sample import TRAIN_ROOMS, rng_for
+from sim.tasks.sample import rng_for
 
 _MAX_STEPS: Final = 40
 #: How often an instruction says where a thing is that is in view; the simulator's do, where a robot sees more than was thought.

@@ -32,7 +32,7 @@ from tqdm import tqdm
 from configs.arguments import command, read_arguments
 from configs.compose import group_file
 from configs.schema.backend import BackendConfig
-from configs.schema.collect import CollectConfig
+from configs.schema.collect import TRAIN_ROOMS, CollectConfig
 from configs.schema.model import ModelConfig
 from configs.validate import ConfigError, build
 from data.files import write_text
@@ -55,7 +55,6 @@ from proprio_mllm.training.asking import replies
 from proprio_mllm.training.sources import ViewRow, Views
 from sim.collection.collect import collect
 from sim.scene.rooms import room_names
-from sim.tasks.sample import TRAIN_ROOMS
 
 _ABOUT_THINGS: Final = ("side", "distance", "height", "arm", "reach")
 _ABOUT_SELF: Final = ("hands", "pelvis")

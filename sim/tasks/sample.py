@@ -15,6 +15,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from configs.schema.collect import TRAIN_ROOMS
 from interface.bodies import PAPER_ROBOTS
 from robots.build_solver import robot_kit
 from robots.spec import load_robot
@@ -29,8 +30,6 @@ from sim.tasks.task import Placement, Start, Task
 from sim.world.placement import OVERHANG_SHARE, fits_on
 from sim.world.world import World, WorldError
 
-#: Rooms of the training tasks: of every kind one room is kept back.
-TRAIN_ROOMS: Final = ("kitchen_1", "kitchen_2", "living_room_1", "living_room_2", "bedroom_1", "bathroom_1")
 ROOMS: Final = room_names()
 #: Movable types that occur in no training task.
 UNSEEN_TYPES: Final = ("Kettle", "Tomato", "Pan", "WineBottle", "AlarmClock", "Vase", "HandTowel", "PepperShaker")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from configs.schema.collect import CollectConfig
+from configs.schema.collect import TRAIN_ROOMS, CollectConfig
 from configs.schema.data import ReplayConfig
 from data.generator import generate_clip
 from data.retarget import Retargeter
@@ -24,7 +24,7 @@ from sim.collection.collect import rows_of_part
 from sim.collection.demonstrations import lessons_of_part
 from sim.collection.replay import _world, replay_clip
 from sim.session.session import Session
-from sim.tasks.sample import BENCHMARK_SEEDS, TRAIN_ROOMS, UNSEEN_TYPES, sample_task
+from sim.tasks.sample import BENCHMARK_SEEDS, UNSEEN_TYPES, sample_task
 from sim.tasks.task import Task, load_benchmark
 from sim.world.world import World
 

@@ -5,6 +5,7 @@ from collections import Counter
 
 import pytest
 
+from configs.schema.collect import TRAIN_ROOMS
 from interface.bodies import PAPER_ROBOTS
 from sim.benchmark.certificates import certificates_text, load_certificates, time_limit_of
 from sim.benchmark.commands import main, rebuild
@@ -12,7 +13,7 @@ from sim.benchmark.composition import COMPOSITION
 from sim.benchmark.generate import Slot, counts, moved, named_types, slots
 from sim.scene.catalogue import load_catalogue
 from sim.tasks.families import FAMILIES
-from sim.tasks.sample import BENCHMARK_SEEDS, TRAIN_ROOMS, room_start, scene_of
+from sim.tasks.sample import BENCHMARK_SEEDS, room_start, scene_of
 from sim.tasks.task import BENCHMARK_PATH, load_benchmark, tasks_text
 
 TASKS = load_benchmark()

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from configs.schema.collect import TRAIN_ROOMS
 from interface.bodies import PAPER_ROBOTS
 from robots.spec import load_robot
 from sim.tasks.families import CATEGORIES
-from sim.tasks.sample import BENCHMARK_SEEDS, ROOMS, TRAIN_ROOMS, TRAIN_SEEDS, sample_task, scene_of, start_height_m
+from sim.tasks.sample import BENCHMARK_SEEDS, ROOMS, TRAIN_SEEDS, sample_task, scene_of, start_height_m
 from sim.tasks.task import Task
 from sim.world.facts import world_facts
 from sim.world.world import World
