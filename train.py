@@ -37,21 +37,17 @@ def make_data(cfg: TrainConfig) -> None:
 
 def make_shards(cfg: TrainConfig) -> None:
     """Posed views, and the rules' lessons on training tasks."""
-    from configs.schema.collect import TRAIN_ROOMS
     from configs.schema.collect import CollectConfig as ShardConfig
     from proprio_mllm.evaluation.dagger import collect_lessons
     from proprio_mllm.training.paths import StagePaths
     from sim.collection.collect import collect
 
-    kinds: tuple[tuple[str, Literal["views", "demos"], int, int, tuple[str, ...]], ...]
-    kinds = (
-        ("views", "views", cfg.collect.views, 240, TRAIN_ROOMS),
-        ("lessons", "demos", cfg.collect.lessons, 10, ("kitchen_1", "living_room_1")),  # where a family fits into no drawn room
-    )
-    for name, kind, count, part, rooms in kinds:
+    kinds: tuple[tuple[str, Literal["views", "demos"], int, int], ...]
+    kinds = (("views", "views", cfg.collect.views, 240), ("lessons", "demos", cfg.collect.lessons, 10))
+    for name, kind, count, part in kinds:
         shards = ShardConfig(
             kind=kind, out=str(StagePaths(cfg).shards(name)), count=count, seed=cfg.seed, image_size=cfg.model.image_size,
-            part_size=part, workers=cfg.collect.workers, robots=cfg.data.robots, rooms=rooms,
+            part_size=part, workers=cfg.collect.workers, robots=cfg.data.robots,
             foreseen=cfg.collect.foreseen and name == "lessons",
         )  # fmt: skip
         write = collect_lessons if name == "lessons" else collect

@@ -148,7 +148,7 @@ class AlignmentConfig:
         text: loop of phase 2a-i, motion and text; vision and CSE frozen.
         image: loop of phase 2a-ii, motion and image; vision frozen.
         joint: loop of phase 2b; rows, LoRA, CSE and merger train.
-        plan_share: share of the joint batches that are of episodes: decisions with pictures and motion, episodes in words.
+        plan_share: share of a phase's batches that are of episodes: decisions with pictures and motion, episodes in words.
         text_share: share of episodes in words among them.
         judge_share: share of judging questions among the decisions.
         questions: body-relative questions packed per image.

@@ -28,9 +28,8 @@ class StagePaths:
 
     def __init__(self, cfg: TrainConfig) -> None:
         self.root = Path(cfg.output) / cfg.model.name
-        own = cfg.shared_seed is None or cfg.shared_seed == cfg.seed
-        self.variant = cfg.variant if own else f"{cfg.variant}-{cfg.seed}"
-        self._seeds = cfg.seed, cfg.seed if cfg.shared_seed is None else cfg.shared_seed
+        self._seed, self._shared_seed = cfg.seed, cfg.seed if cfg.shared_seed is None else cfg.shared_seed
+        self.variant = cfg.variant if self._shared_seed == self._seed else f"{cfg.variant}-{cfg.seed}"
 
     def shards(self, kind: str) -> Path:
         """Folder of shards: `views`, `demos` …; docs/data.md lists them."""
@@ -42,7 +41,7 @@ class StagePaths:
 
     def seed(self, name: str) -> int:
         """Seed of a training stage."""
-        return self._seeds[name in _SHARED]
+        return self._shared_seed if name in _SHARED else self._seed
 
     def model(self, name: str) -> Path:
         """The model folder that a stage leaves behind."""

@@ -68,7 +68,7 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
         ):
             continue
         key = pipeline.key(stage)
-        target = Path(folder) / pipeline.cfg.model.name / release_name(stage, pipeline.cfg.variant)
+        target = Path(folder) / pipeline.cfg.model.name / release_name(stage, pipeline.paths.variant)
         if stage in ("practice", "base") and _released_key(target) == key:  # every variant's export meets them again
             continue
         with new_folder(target) as work:

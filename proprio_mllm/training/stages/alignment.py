@@ -50,14 +50,12 @@ class AlignmentStage:
         demos = lessons_of(pipeline, model.cfg)
         turns, words = turns_of(pipeline, model, demos, read), episodes_in_words(pipeline, model, f"{key}/words")
         data = AlignmentData(model, tokenizer, clips, views, demos, turns, words, pipeline.cfg.alignment)
-        # without proprioception there is no motion to align with text
-        wanted = [phase for phase in PHASES if model.cfg.proprioception or phase != "text"]
-        loops = {phase: getattr(pipeline.cfg.alignment, phase) for phase in wanted}
-        for phase, loop in loops.items():
-            train_only(model, PHASES[phase].groups)
-            pipeline.loop(
-                AlignmentObjective(model, data, phase, pipeline.cfg.alignment, f"{key}/{phase}"), loop, folder / phase
-            )
+        for phase, about in PHASES.items():
+            if phase == "text" and not model.cfg.proprioception:  # there is no motion to align with text
+                continue
+            train_only(model, about.groups)
+            objective = AlignmentObjective(model, data, phase, pipeline.cfg.alignment, f"{key}/{phase}")
+            pipeline.loop(objective, getattr(pipeline.cfg.alignment, phase), folder / phase)
         pipeline.store("alignment", model, read)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
         felt = {} if turns.codes is None else body_state_accuracy(model, demos, turns.codes)
