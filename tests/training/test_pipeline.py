@@ -106,7 +106,7 @@ def test_the_control_trains_without_motion(trained: Pipeline) -> None:
     assert phases == {"image", "joint", "model"}
 
 
-def test_another_seed_of_alignment_goes_on_from_the_shared_stages(trained: Pipeline) -> None:
+def test_another_seed_of_alignment_goes_on_from_the_shared_stages(trained: Pipeline, tmp_path: Path) -> None:
     cfg = dataclasses.replace(trained.cfg, stage="alignment", seed=7, shared_seed=trained.cfg.seed)
     other = Pipeline(STAGES, cfg, collect, lessons=Lessons())
     assert other.is_current("base") and other.key("base") == trained.key("base")
@@ -114,6 +114,7 @@ def test_another_seed_of_alignment_goes_on_from_the_shared_stages(trained: Pipel
     assert other.run("alignment") is not None and trained.is_current("alignment")
     weights = [read_tensors(p.paths.model("alignment") / "heads.safetensors") for p in (trained, other)]
     assert any(not torch.equal(weights[0][name], weights[1][name]) for name in weights[0] if name.startswith("cse"))
+    assert "full-7-alignment" in {path.name for path in release.export(other, tmp_path)}
     with pytest.raises(ValueError, match="shared_seed 0 with stage=base"):
         dataclasses.replace(trained.cfg, stage="base", shared_seed=0)
 
@@ -154,7 +155,8 @@ def test_a_phase_changes_only_its_groups(trained: Pipeline, phase: str) -> None:
     changed = {group_of(name) for name, tensor in model.named_parameters() if not torch.equal(tensor, before[name])}
     image = {"rows", "lora", "cse", "mpe"}
     allowed = {"text": {"rows", "lora"}, "image": image, "joint": image | {"merger"}}
-    assert "rows" in changed and changed <= allowed[phase]
+    assert {"rows", "lora"} <= changed <= allowed[phase]
+    assert ("cse" in changed) == (phase != "text")
 
 
 def test_adapters_train_apart(trained: Pipeline) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from configs.arguments import read_arguments
-from configs.schema.collect import CollectConfig
+from configs.schema.collect import TRAIN_ROOMS, CollectConfig
 from configs.validate import ConfigError
 from data.motion import N_FEATURES
 from data.shards import ShardReader, decode_depth, decode_png, decode_segmentation
@@ -203,3 +203,8 @@ def test_arguments_are_read_and_wrong_ones_refused(capsys):
         read_arguments(CollectConfig, ["kind=demos", "out=x", "count=1", "robots=[]"])
     assert main(["colour=red"]) == 2
     assert "colour" in capsys.readouterr().err
+
+
+def test_views_show_every_training_room() -> None:
+    rows = rows_of_part(CollectConfig("views", "unused", 12, image_size=16, views_per_world=1), 0)
+    assert {row["room"] for row in rows} == set(TRAIN_ROOMS)
