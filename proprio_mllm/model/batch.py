@@ -52,6 +52,19 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
+class Shown:
+    """Where a thing that a conversation names is in its picture.
+
+    Attributes:
+        name: as the text has it at its next mention, with the blank before it.
+        cells: (N,) share of the thing's pixels in each merged cell, raster order; they add up to 1.
+    """
+
+    name: str
+    cells: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
 class Example:
     """A conversation, or a sequence that is tokens already, and its views in the order of its images.
 
@@ -60,12 +73,14 @@ class Example:
         views: one per image.
         tokens: the sequence, one pad per image.
         start: position of its first token, where what stands before it has been read already.
+        shown: where things are in its only picture, in the order in which it names them.
     """
 
     messages: tuple[Message, ...] = ()
     views: tuple[View, ...] = ()
     tokens: Encoded | None = None
     start: int = 0
+    shown: tuple[Shown, ...] = ()
 
     @property
     def length(self) -> int:
@@ -127,6 +142,23 @@ class Logs(Movable):
 
 
 @dataclass(frozen=True, slots=True)
+class Named(Movable):
+    """Names of things in a batch, K of them, and where the things are seen (`proprio_mllm.training.pointing`).
+
+    Attributes:
+        row: (K,) row of the batch.
+        place: (K,) position of the last token of the name.
+        first: (K,) position of the row's first visual token.
+        cells: (K, N) from `Shown`.
+    """
+
+    row: Tensor
+    place: Tensor
+    first: Tensor
+    cells: Tensor
+
+
+@dataclass(frozen=True, slots=True)
 class Batch(Movable):
     """Model inputs.
 
@@ -138,6 +170,7 @@ class Batch(Movable):
         images: the images of all rows in order, or None.
         out_of: supervised tokens of the whole batch of which it is a part, 0 where it is one by itself.
         logs: what stands before the rows, in the order of the rows; None where each row is all there is.
+        named: names whose things are known to be in the pictures, or None.
     """
 
     input_ids: Tensor
@@ -147,6 +180,7 @@ class Batch(Movable):
     images: ImageBatch | None = None
     out_of: int = 0
     logs: Logs | None = None
+    named: Named | None = None
 
     def then(self, tokens: Tensor) -> Batch:
         """More text (B, K) after each left-padded row, where a cache holds the rows."""
@@ -284,7 +318,25 @@ class Collator:
             self._put_beside(ids, labels, where)
             rows.append((ids, labels, where))
             first += named
-        return self._pad(rows, images, side)
+        batch = self._pad(rows, images, side)
+        return replace(batch, named=self._named(batch.input_ids, examples))
+
+    def _named(self, input_ids: Tensor, examples: Sequence[Example]) -> Named | None:
+        found: list[tuple[int, int, int, Shown]] = []
+        for row, example in enumerate(examples):
+            if not example.shown:
+                continue
+            ids = input_ids[row].tolist()
+            first = at = ids.index(self.image_token)
+            for shown in example.shown:
+                name = self.tokenizer(shown.name, add_special_tokens=False)["input_ids"]
+                at = next(k for k in range(at, len(ids)) if ids[k : k + len(name)] == name) + len(name)
+                found.append((row, at - 1, first, shown))
+        if not found:
+            return None
+        row, place, first, shown = zip(*found, strict=True)
+        cells = torch.from_numpy(np.stack([one.cells for one in shown]))
+        return Named(torch.tensor(row), torch.tensor(place), torch.tensor(first), cells)
 
     def _put_beside(self, ids: Sequence[int], labels: Sequence[int], where: Tensor) -> None:
         """Moves the positions (3, S) of motion that is not learnt, and of what follows it, back by the motion's length."""

@@ -16,8 +16,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from proprio_mllm.model.modeling import ProprioMLLM
-
 
 def shown_shares(segmentation: Tensor, grid: tuple[int, int], types: int) -> Tensor:
     """Share (I, N, C) of each cell's pixels that show each type, in [0, 1].
@@ -47,19 +45,18 @@ class DenseHead(nn.Module):
     """Scores object names from visual tokens.
 
     Args:
-        model: gives the hidden size and the tokenizer.
-        type_names: the C names, in the order of the segmentation's indices.
+        names: tokens of the C types' names, in the order of the segmentation's indices.
         min_share: smallest share of a cell's pixels that counts as showing a type.
     """
 
     name_ids: Tensor
     name_mask: Tensor
 
-    def __init__(self, model: ProprioMLLM, type_names: Sequence[str], min_share: float = 0.03) -> None:
+    def __init__(self, names: Sequence[Sequence[int]], min_share: float = 0.03) -> None:
         super().__init__()
-        if not type_names:
-            raise ValueError("type_names is empty")
-        rows = model.processor.tokenizer(list(type_names), add_special_tokens=False)["input_ids"]
+        if not names:
+            raise ValueError("names is empty")
+        rows = [list(name) for name in names]
         longest = max(len(row) for row in rows)
         self.register_buffer("name_ids", torch.tensor([row + [0] * (longest - len(row)) for row in rows]), persistent=False)
         mask = torch.tensor([[1.0] * len(row) + [0.0] * (longest - len(row)) for row in rows])

@@ -20,6 +20,7 @@ from interface.bodies import KEY_BODIES
 from interface.steps import Action
 from proprio_mllm.model.geometry import arm_length_m
 from proprio_mllm.model.prompts import Style
+from proprio_mllm.model.wording import id_words
 
 #: Bearing within which an object counts as ahead, degrees.
 AHEAD_DEG = 8.0
@@ -49,8 +50,17 @@ QUESTIONS: Mapping[str, Mapping[Style, str]] = {
 }
 
 
+def spoken(object_id: str, style: Style) -> str:
+    """How questions name an object: terse ones in the words of episodes, so that a name is the same tokens in both.
+
+    A word that is a token, its blank included (`proprio_mllm.model.word_tokens`), is found in a text only where no letter
+    stands before the blank: hence two of them.
+    """
+    return "".join(f" {word} " for word in id_words(object_id)).rstrip() if style == "terse" else object_id
+
+
 def ask(kind: str, name: str = "", style: Style = "terse") -> str:
-    """The question of a kind about a named object (id or type); `see` is about none.
+    """The question of a kind about an object, named as `spoken` does; `see` is about none.
 
     Raises:
         ValueError: on an unknown kind.

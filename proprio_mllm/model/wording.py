@@ -87,7 +87,12 @@ class WordEpisode:
 def id_words(object_id: str) -> Words:
     """`DiningTable_1` as `dining`, `table`, `_1`."""
     name, _, number = object_id.rpartition("_")
-    return (*(word.lower() for word in _TYPE_WORD.findall(name or object_id)), f"_{number}")
+    return (*name_words(name or object_id), f"_{number}")
+
+
+def name_words(name: str) -> Words:
+    """A type's name as an id has it: `DiningTable` as `dining`, `table`."""
+    return tuple(word.lower() for word in _TYPE_WORD.findall(name))
 
 
 def text_words(text: str) -> Words:

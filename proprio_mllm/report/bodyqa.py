@@ -45,7 +45,7 @@ from proprio_mllm.evaluation.showing import grey
 from proprio_mllm.model.batch import Example
 from proprio_mllm.model.building import load_model, load_motion
 from proprio_mllm.model.prompts import body_state_prompt, looking
-from proprio_mllm.model.questions import ask
+from proprio_mllm.model.questions import ask, spoken
 from proprio_mllm.planners.chat.view import body_text, encoded
 from proprio_mllm.planners.protocol import check_weights
 from proprio_mllm.report.statistics import wilson
@@ -148,7 +148,7 @@ def questions_of(views: Views, count: int, seed: int) -> list[Question]:
     """Up to `count` questions, kinds in turn, one of a kind about a view.
 
     Args:
-        views: every row is asked about; their style is terse, so that a question ends in its thing.
+        views: every row is asked about.
         count: how many.
         seed: of the choice of things.
     """
@@ -156,8 +156,8 @@ def questions_of(views: Views, count: int, seed: int) -> list[Question]:
     for index in range(len(views.reader)):
         row = views.row(index)
         for kind in _ABOUT_THINGS:
-            for text, answer in views.pairs(row, (kind,), 1, rng):
-                found.append(Question(kind, text.rpartition(" ")[2], answer, row))
+            for one in views.asked(row, (kind,), 1, rng):
+                found.append(Question(kind, str(one.thing["id"]), one.answer, row))
         hands, height = body_state(row.motion)
         found += [Question("hands", "", hands, row), Question("pelvis", "", height, row)]
     share = {kind: [one for one in found if one.kind == kind] for kind in _KINDS}
@@ -205,7 +205,7 @@ def _stored(folder: str) -> tuple[ModelConfig, Answering]:
         if blind:
             assert view.key_bodies is not None
             view = replace(view, image=grey(view.image), key_bodies=np.zeros_like(view.key_bodies))
-        return Example(looking([(ask(one.kind, one.thing, style), "")], codes, style), (view,))
+        return Example(looking([(ask(one.kind, spoken(one.thing, style), style), "")], codes, style), (view,))
 
     def answer(asked: Sequence[Question], blind: bool) -> list[str]:
         size, said = 64, list[str]()

@@ -33,13 +33,14 @@ from data.motion import HAND_OPENING, OPEN_HAND, PELVIS_HEIGHT
 from proprio_mllm.model.batch import Batch, Collator, Example
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.prompts import Style, body_state_prompt, described_motion, filled_motion, looking, made_motion
+from proprio_mllm.model.prompts import Style, body_state_prompt, described_motion, filled_motion, made_motion
 from proprio_mllm.training.asking import answer_shares
-from proprio_mllm.training.base import EPISODE_ROWS
+from proprio_mllm.training.base import EPISODE_ROWS, looking_around
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.phrases import body_state_words
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views, grips_of
+from proprio_mllm.training.pointing import Pointing
+from proprio_mllm.training.sources import Clips, Demos, Views, grips_of
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordBatch, WordsObjective
 
@@ -137,9 +138,8 @@ class AlignmentData:
 
     def _body(self, index: int, rng: np.random.Generator) -> Example:
         row = self.views.row(index)
-        pairs = self.views.pairs(row, (*GROUNDING, *BODY_RELATIVE), self._cfg.questions, rng)
         codes = self.tokenizer.encode_window(row.motion) if self._proprioception else None
-        return Example(looking(pairs or [self.views.listing(row)], codes, self._style), (row.view,))
+        return looking_around(self.views, row, self._cfg.questions, rng, codes)
 
 
 def body_state(motion: NDArray[np.floating]) -> tuple[str, str]:
@@ -183,6 +183,7 @@ class AlignmentObjective(Objective):
         self.key = key
         kinds = PHASES[phase].kinds
         self._data, self._cfg = data, cfg
+        self._pointing = Pointing(model, cfg.point_weight)
         self._kinds: tuple[Kind, ...] = kinds if model.cfg.proprioception else ("body", "plan")
 
     def kind(self, rng: np.random.Generator) -> Kind:
@@ -210,5 +211,6 @@ class AlignmentObjective(Objective):
         if isinstance(batch, WordBatch):
             return self._data.words.loss(module, batch, generator)
         kind, inputs = batch
-        out = module(inputs)
-        return out.loss, {f"{kind}_loss": float(out.loss.detach()), f"{kind}_accuracy": out.correct / max(inputs.out_of, 1)}
+        out, loss, pointed = self._pointing(module, inputs)
+        accuracy = out.correct / max(inputs.out_of, 1)
+        return loss, pointed | {f"{kind}_loss": float(out.loss.detach()), f"{kind}_accuracy": accuracy}

@@ -25,7 +25,8 @@ from proprio_mllm.training.asking import answer_shares
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.phrases import phrase
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views
+from proprio_mllm.training.pointing import Pointing
+from proprio_mllm.training.sources import BODY_RELATIVE, CELL, GROUNDING, Clips, Demos, ViewRow, Views
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordBatch, WordsObjective
 
@@ -38,19 +39,19 @@ PHRASES: Final = 0.1
 class _WithDense(nn.Module):
     """Model and dense head as one module, so that one optimiser and one checkpoint hold both."""
 
-    def __init__(self, model: ProprioMLLM, head: DenseHead) -> None:
+    def __init__(self, model: ProprioMLLM, head: DenseHead, point_weight: float) -> None:
         super().__init__()
         self.model = model
         self.head = head
+        self._pointing = Pointing(model, point_weight)
 
     def forward(self, batch: _JointBatch) -> tuple[Tensor, dict[str, float]]:
         values: dict[str, float] = {}
         total: Tensor | None = None
         if batch.text is not None:
-            out = self.model(batch.text)
-            total = out.loss
+            out, total, pointed = self._pointing(self.model, batch.text)
             accuracy = out.correct / max(batch.text.out_of or out.supervised, 1)
-            values |= {f"{batch.kind}_loss": float(out.loss.detach()), f"{batch.kind}_accuracy": accuracy}
+            values |= pointed | {f"{batch.kind}_loss": float(out.loss.detach()), f"{batch.kind}_accuracy": accuracy}
             visual = out.visual
         else:
             assert batch.images is not None
@@ -80,7 +81,7 @@ class _Base(Objective):
     """What both objectives share: the sources and the assembly of view batches."""
 
     def __init__(self, model: ProprioMLLM, head: DenseHead, views: Views, cfg: BaseConfig, key: str) -> None:
-        self.module: nn.Module = _WithDense(model, head)
+        self.module: nn.Module = _WithDense(model, head, cfg.point_weight)
         self._model = model
         self.key = key
         self._views, self._cfg = views, cfg
@@ -94,15 +95,14 @@ class _Base(Objective):
     def _view_batch(self, rng: np.random.Generator, size: int, questions: int) -> _JointBatch:
         rows = [self._views.row(i) for i in rng.choice(self._views.split.train, size)]
         segmentation = torch.from_numpy(np.stack([row.segmentation for row in rows]))
-        grid = segmentation.shape[1] // 28, segmentation.shape[2] // 28
+        grid = segmentation.shape[1] // CELL, segmentation.shape[2] // CELL
         shares = shown_shares(segmentation, grid, len(self._views.type_names))
         if not questions:
             return _JointBatch("dense", None, self._collator.images([row.view for row in rows]), shares, 1.0)
         examples = []
         for row in rows:
             # the list comes last: its order, from left to right, would give away where things are
-            pairs = [*self._views.pairs(row, (*GROUNDING, *BODY_RELATIVE), questions, rng), self._views.listing(row)]
-            examples.append(Example(looking(pairs, style=self._views.style), (row.view,)))
+            examples.append(looking_around(self._views, row, questions, rng, listing=True))
         return _JointBatch("look", self._collator(examples), None, shares, self._cfg.dense_weight)
 
 
@@ -187,6 +187,30 @@ class JointObjective(_Base):
         return super().loss(module, batch, generator)
 
 
+def looking_around(
+    views: Views,
+    row: ViewRow,
+    questions: int,
+    rng: np.random.Generator,
+    codes: Sequence[int] | None = None,
+    listing: bool = False,
+) -> Example:
+    """Questions about the things in a view, with where they are in it.
+
+    Args:
+        views: asks.
+        row: the view.
+        questions: most questions.
+        rng: draws them.
+        codes: motion tokens before the first question, or None.
+        listing: whether the list of what is in view follows; it does where there is nothing to ask.
+    """
+    asked = views.asked(row, (*GROUNDING, *BODY_RELATIVE), questions, rng)
+    pairs = [(one.question, one.answer) for one in asked]
+    pairs += [views.listing(row)] if listing or not pairs else []
+    return Example(looking(pairs, codes, views.style), (row.view,), shown=views.shown(row, asked))
+
+
 @torch.no_grad()
 def grounding_accuracy(
     model: ProprioMLLM,
@@ -213,10 +237,10 @@ def grounding_accuracy(
         asked: list[Example] = []
         answers: list[str] = []
         for row in rows:
-            for question, answer in views.pairs(row, (kind,), 1, rng):
+            for one in views.asked(row, (kind,), 1, rng):
                 motion = None if tokens is None else tokens.encode_window(row.motion)
-                asked.append(Example(looking([(question, "")], motion, views.style), (row.view,)))
-                answers.append(answer)
+                asked.append(Example(looking([(one.question, "")], motion, views.style), (row.view,)))
+                answers.append(one.answer)
         if asked:
             result |= answer_shares(model, kind, asked, answers)
     result["asked_views"] = float(len(rows))

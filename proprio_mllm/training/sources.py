@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -24,14 +24,16 @@ from configs.schema.model import ModelConfig
 from data.motion import HAND_OPENING, KEY_BODY_COUNT, OPEN_HAND
 from data.shards import Manifest, ShardError, ShardReader, decode_depth, decode_motion, decode_png, decode_segmentation
 from interface.observation import Camera
-from proprio_mllm.model.batch import View
+from proprio_mllm.model.batch import Shown, View
 from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, answers
-from proprio_mllm.model.questions import ANSWERS, ask
+from proprio_mllm.model.questions import ANSWERS, ask, spoken
 
 #: One in this many views, episodes and clips is never trained on.
 HELD_OUT = 20
+#: Rows and columns of pixels of a merged visual token.
+CELL: Final = 28
 GROUNDING = ("side", "distance", "height")
 BODY_RELATIVE = ("arm", "reach", "shift")
 
@@ -93,6 +95,15 @@ class ViewRow:
     points_m: NDArray[np.float32]
 
 
+class Asked(NamedTuple):
+    """A question about a thing in a view, its answer, how it names the thing, and what the simulator wrote about that."""
+
+    question: str
+    answer: str
+    name: str
+    thing: Mapping[str, Any]
+
+
 class Views:
     """Posed views with depth and segmentation."""
 
@@ -119,18 +130,31 @@ class Views:
         objects = tuple(json.loads(row["objects"]))
         return ViewRow(view, motion, objects, decode_segmentation(row["segmentation"], height, width), points)
 
-    def pairs(self, row: ViewRow, kinds: Sequence[str], count: int, rng: np.random.Generator) -> list[tuple[str, str]]:
-        """Question and answer pairs about visible objects, at most `count`, drawn without repetition."""
+    def asked(self, row: ViewRow, kinds: Sequence[str], count: int, rng: np.random.Generator) -> list[Asked]:
+        """Questions about visible objects, at most `count`, drawn without repetition."""
         bodies = row.view.key_bodies
         assert bodies is not None
-        found: list[tuple[str, str]] = []
+        found: list[Asked] = []
         visible = [obj for obj in row.objects if int(obj["pixels"]) >= 6]
         for obj in visible:
-            centre = np.asarray(obj["center_in_pelvis"], dtype=np.float64)
+            centre, name = np.asarray(obj["center_in_pelvis"], dtype=np.float64), spoken(str(obj["id"]), self.style)
             for kind in kinds:
-                found.append((ask(kind, str(obj["id"]), self.style), ANSWERS[kind](centre, bodies)))
+                found.append(Asked(ask(kind, name, self.style), ANSWERS[kind](centre, bodies), name, obj))
         order = rng.permutation(len(found))[:count]
         return [found[i] for i in order]
+
+    def shown(self, row: ViewRow, asked: Sequence[Asked]) -> tuple[Shown, ...]:
+        """Where the things are that are asked about."""
+        height, width = (size // CELL for size in row.segmentation.shape)
+        found: list[Shown] = []
+        for one in asked:
+            left, top, right, bottom = map(int, one.thing["bbox"])
+            mask = np.zeros(row.segmentation.shape, dtype=np.float32)
+            kind = self.type_names.index(str(one.thing["id"]).rpartition("_")[0])
+            mask[top:bottom, left:right] = row.segmentation[top:bottom, left:right] == kind
+            cells = mask.reshape(height, CELL, width, CELL).sum((1, 3)).ravel()
+            found.append(Shown(f" {one.name.lstrip()}", cells / cells.sum()))
+        return tuple(found)
 
     def listing(self, row: ViewRow) -> tuple[str, str]:
         """Image to text: the names of the objects in view, nearest to the top-left corner first."""

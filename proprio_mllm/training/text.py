@@ -13,7 +13,8 @@ from interface.actions import ACTIONS
 from proprio_mllm.model.chat import render
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import critic_prompt, looking, self_ask_prompt
-from proprio_mllm.training.goals import type_words
+from proprio_mllm.model.word_tokens import tokens_of
+from proprio_mllm.model.wording import name_words
 from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
 
@@ -39,7 +40,8 @@ def corpus(
     texts.extend(render(phrase(clips, rng, cfg.prompt).messages) for _ in range(limit // 4))
     for index in _some(views.split.train, limit // 4, rng):
         row = views.row(int(index))
-        pairs = [views.listing(row), *views.pairs(row, (*GROUNDING, *BODY_RELATIVE), 10, rng)]
+        asked = views.asked(row, (*GROUNDING, *BODY_RELATIVE), 10, rng)
+        pairs = [views.listing(row), *((one.question, one.answer) for one in asked)]
         texts.append(render(looking(pairs, None, cfg.prompt)))
     texts.append(render(critic_prompt("pick up the mug", (), (), None, cfg.prompt)) + " yes no none")
     texts.append(render(self_ask_prompt("held", (), (), None, cfg.prompt)) + " open closed on off in lifted")
@@ -53,7 +55,7 @@ def whole_words(views: Views) -> list[str]:
 
 @torch.no_grad()
 def start_from_words(model: ProprioMLLM, names: Sequence[str]) -> None:
-    """Lets the embedding of each type name start as that of its words: `PaperTowelRoll` as ` paper towel roll`.
+    """Lets the embedding of each type name start as that of its words: `PaperTowelRoll` as `paper`, `towel`, `roll`.
 
     What an instruction calls a thing and the thing's id then resemble each other before any training, as the two do in a
     pretrained model. The sum over n words is divided by √n, which keeps the scale of a fresh row.
@@ -67,11 +69,12 @@ def start_from_words(model: ProprioMLLM, names: Sequence[str]) -> None:
     """
     embeddings: Any = model.core.get_input_embeddings()
     tokenizer, rows = model.processor.tokenizer, embeddings.weight
+    spelt = tokens_of(tokenizer)
     for name in names:
         own = tokenizer(name, add_special_tokens=False).input_ids
         if len(own) != 1:
             raise ValueError(f"type {name!r} is {len(own)} tokens; it must be one")
-        words = tokenizer(f" {type_words(name)}", add_special_tokens=False).input_ids
+        words = spelt.tokens(name_words(name))
         rows[own[0]] = rows[words].sum(0) / len(words) ** 0.5
 
 

@@ -10,8 +10,8 @@ from typing import Any
 from proprio_mllm.model.building import build_model, build_processor, load_model
 from proprio_mllm.model.dense import DenseHead
 from proprio_mllm.model.groups import train_only
-from proprio_mllm.model.word_tokens import add_word_tokens
-from proprio_mllm.model.wording import id_words
+from proprio_mllm.model.word_tokens import add_word_tokens, tokens_of
+from proprio_mllm.model.wording import name_words
 from proprio_mllm.training.base import DenseObjective, JointObjective, grounding_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config, seeded
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
@@ -27,7 +27,7 @@ class BaseStage:
     name = "base"
     needs = ("practice",)
     shards = ("views", "lessons", "clips")
-    recipe = 7
+    recipe = 8
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """Of the tokenizer only the words: no stage before it, and no motion in its prompts."""
@@ -48,16 +48,16 @@ class BaseStage:
         model = build_model(plain, processor, cfg.seed)
         adopt(model, load_model(pipeline.paths.model("practice")))
         start_from_words(model, views.type_names)
-        names = [f" {' '.join(id_words(f'{name}_1')[:-1])}" for name in views.type_names]
-        head = seeded(lambda: DenseHead(model, names), cfg.seed)
+        words = tokens_of(processor.tokenizer)
+        head = seeded(lambda: DenseHead([words.tokens(name_words(name)) for name in views.type_names]), cfg.seed)
         dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
         chosen = {id(p) for p in train_only(model, ("vision", "merger"))} | {id(p) for p in head.parameters()}
         for parameter in dense.module.parameters():
             parameter.requires_grad_(id(parameter) in chosen)
         pipeline.loop(dense, cfg.base.dense, folder / "dense")
         model.requires_grad_(True)
-        turns, words = turns_of(pipeline, model, demos), episodes_in_words(pipeline, model, f"{key}/words")
-        joint = JointObjective(model, head, views, turns, demos, clips, words, cfg.base, f"{key}/joint")
+        turns, episodes = turns_of(pipeline, model, demos), episodes_in_words(pipeline, model, f"{key}/words")
+        joint = JointObjective(model, head, views, turns, demos, clips, episodes, cfg.base, f"{key}/joint")
         pipeline.loop(joint, cfg.base.joint, folder / "joint")
         pipeline.store("base", model)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE))
