@@ -131,15 +131,15 @@ class Views:
         return ViewRow(view, motion, objects, decode_segmentation(row["segmentation"], height, width), points)
 
     def asked(self, row: ViewRow, kinds: Sequence[str], count: int, rng: np.random.Generator) -> list[Asked]:
-        """Questions about visible objects, at most `count`, drawn without repetition."""
+        """Questions about visible objects, at most `count`, one about each: a second would be answered by the first."""
         bodies = row.view.key_bodies
         assert bodies is not None
         found: list[Asked] = []
         visible = [obj for obj in row.objects if int(obj["pixels"]) >= 6]
         for obj in visible:
             centre, name = np.asarray(obj["center_in_pelvis"], dtype=np.float64), spoken(str(obj["id"]), self.style)
-            for kind in kinds:
-                found.append(Asked(ask(kind, name, self.style), ANSWERS[kind](centre, bodies), name, obj))
+            kind = kinds[int(rng.integers(len(kinds)))]
+            found.append(Asked(ask(kind, name, self.style), ANSWERS[kind](centre, bodies), name, obj))
         order = rng.permutation(len(found))[:count]
         return [found[i] for i in order]
 

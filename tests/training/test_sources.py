@@ -8,6 +8,7 @@ import pytest
 
 from configs.schema.model import ModelConfig
 from data.motion import HAND_OPENING, OPEN_HAND
+from proprio_mllm.model.questions import ask
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Demos, Views, grips_of
 
 
@@ -17,10 +18,21 @@ from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Demos, Views
 def test_views_ask_in_the_models_style(shards: Path, cfg: ModelConfig, style: str, wanted: tuple[str, ...]) -> None:
     views = Views(shards / "views", dataclasses.replace(cfg, prompt=style))
     row = next(row for row in map(views.row, views.split.train) if any(obj["id"] == "Lamp_1" for obj in row.objects))
-    asked = [one.question for one in views.asked(row, (*GROUNDING, *BODY_RELATIVE), 100, np.random.default_rng(0))]
+    asked = [one.question for one in views.asked(row, ("side",), 100, np.random.default_rng(0))]
     text = "\n".join([*asked, views.listing(row)[0]])
     for part in wanted:
         assert part in text
+
+
+def test_each_thing_is_asked_about_once_and_every_kind_comes_up(shards: Path, cfg: ModelConfig) -> None:
+    views, rng, kinds = Views(shards / "views", cfg), np.random.default_rng(0), (*GROUNDING, *BODY_RELATIVE)
+    questions: set[str] = set()
+    for row in map(views.row, views.split.train):
+        asked = views.asked(row, kinds, 100, rng)
+        assert sorted(one.thing["id"] for one in asked) == sorted(thing["id"] for thing in row.objects)
+        questions |= {one.question.split()[0] for one in asked}
+        assert len(views.asked(row, kinds, 2, rng)) == 2
+    assert questions == {ask(kind).strip() for kind in kinds}
 
 
 def test_grips_are_rows_of_one_robot_with_the_same_hands_open(shards: Path, cfg: ModelConfig) -> None:

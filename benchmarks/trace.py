@@ -1,0 +1,113 @@
+"""Where a thing's place is lost on its way through a model: from the point map to the tokens that name the thing.
+
+    python -m benchmarks.trace views=outputs/tiny/data/views model=weights/tiny/full
+
+Things in training views are asked about (on which side). Their position in the pelvis heading frame is predicted by ridge
+regression on what stands along the way: the points of the cells that show the thing, their visual tokens as the language model
+gets them and before each of its layers, and the last token of the thing's name before each layer. Printed is the share of the
+variance of x (forward), y (left) and z (up) that is explained for things kept back, and the size of what stands there: what is
+small beside the stream that it enters is lost in it.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from configs.arguments import command, read_arguments
+from proprio_mllm.model.batch import Batch, Collator, Example
+from proprio_mllm.model.building import load_model
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.prompts import looking
+from proprio_mllm.training.sources import Views
+
+_TOGETHER: Final = 16
+#: Ridge penalties; of each the best counts, the same for all places.
+_PENALTIES: Final = (10.0, 100.0, 1000.0)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Command line.
+
+    Attributes:
+        views: folder of `views` shards.
+        model: folder of a stored model with CSE.
+        rows: how many views are asked about.
+    """
+
+    views: str
+    model: str
+    rows: int = 200
+
+
+def traced(model: ProprioMLLM, batch: Batch) -> dict[str, Tensor]:
+    """What stands at each place on the way (K, features), for the K named things of a batch."""
+    named, images = batch.named, batch.images
+    assert named is not None
+    assert images is not None
+    layers: Any = model.core.model.language_model.layers
+    read: list[Tensor] = []
+
+    def keep(_: Any, args: tuple[Any, ...], inputs: dict[str, Any]) -> None:
+        read.append(args[0] if args else inputs["hidden_states"])
+
+    handles = [layer.register_forward_pre_hook(keep, with_kwargs=True) for layer in layers]
+    with torch.no_grad():
+        model(batch)
+        found = {"points": model.spatial(images)[named.row]} if model.cse is not None else {}
+    for handle in handles:
+        handle.remove()
+    cells = named.first[:, None] + torch.arange(named.cells.shape[1])
+    found |= {f"visual tokens, layer {number}": hidden[named.row[:, None], cells] for number, hidden in enumerate(read)}
+    shown = {place: (values.float() * named.cells[..., None]).sum(1) for place, values in found.items()}
+    return shown | {f"name, layer {number}": hidden[named.row, named.place].float() for number, hidden in enumerate(read)}
+
+
+def explained(values: Tensor, truth: Tensor) -> list[float]:
+    """Share of the variance of each column of `truth` (K, 3) in the last quarter that `values` (K, F) explain."""
+    fit = len(values) * 3 // 4
+    values = (values - values[:fit].mean(0)) / (values[:fit].std(0) + 1e-4)
+    values = torch.cat([values, torch.ones(len(values), 1)], 1)
+    best = torch.full((truth.shape[1],), -torch.inf)
+    for penalty in _PENALTIES:
+        normal = values[:fit].T @ values[:fit] + penalty * torch.eye(values.shape[1])
+        missed = values[fit:] @ torch.linalg.solve(normal, values[:fit].T @ truth[:fit]) - truth[fit:]
+        best = torch.maximum(best, 1.0 - missed.square().mean(0) / truth[fit:].var(0))
+    return best.tolist()
+
+
+@command()
+def main(arguments: Sequence[str]) -> int:
+    """Prints the table."""
+    options = read_arguments(Options, arguments)
+    model = load_model(Path(options.model)).eval()
+    views, collator, rng = Views(Path(options.views), model.cfg), Collator(model.processor, model.cfg), np.random.default_rng(0)
+    held, truth, examples = defaultdict[str, list[Tensor]](list), list[Any](), list[Example]()
+    for index in rng.choice(views.split.train, min(options.rows, len(views.split.train)), replace=False):
+        row = views.row(int(index))
+        if asked := views.asked(row, ("side",), 8, rng):
+            pairs = [(one.question, one.answer) for one in asked]
+            examples.append(Example(looking(pairs, None, views.style), (row.view,), shown=views.shown(row, asked)))
+            truth += [one.thing["center_in_pelvis"] for one in asked]
+    for first in range(0, len(examples), _TOGETHER):
+        for place, values in traced(model, collator(examples[first : first + _TOGETHER])).items():
+            held[place].append(values)
+    sys.stdout.write(f"{len(truth)} things in {len(examples)} views\n{'':24} {'x':>6} {'y':>6} {'z':>6} {'size':>8}\n")
+    for place, values in held.items():
+        whole = torch.cat(values)
+        shares = " ".join(f"{share:6.2f}" for share in explained(whole, torch.tensor(truth, dtype=torch.float32)))
+        sys.stdout.write(f"{place:24} {shares} {float(whole.norm(dim=-1).mean()):8.1f}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,43 @@
+"""What a place on the way tells of positions: all where it holds them, nothing where it does not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks.trace import explained, main
+from configs.schema.model import ModelConfig, MotionTokenizerConfig, PointMapConfig, TinyTextConfig, TinyVisionConfig
+from proprio_mllm.model.building import build_model, build_processor, save_model
+from tests.training.conftest import TYPES, write_views
+
+
+def test_positions_are_explained_where_they_are_held_and_only_there() -> None:
+    torch.manual_seed(0)
+    truth, noise = torch.randn(400, 3), torch.randn(400, 20)
+    held = torch.cat([noise, truth[:, :2] @ torch.randn(2, 5)], 1)
+    x, y, z = explained(held, truth)
+    assert x > 0.9
+    assert y > 0.9
+    assert z < 0.1
+
+
+def test_the_way_is_printed_place_by_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cfg = ModelConfig(
+        name="test",
+        vocab_size=400,
+        text=TinyTextConfig(hidden=64, layers=2, heads=2, kv_heads=1, intermediate=96),
+        vision=TinyVisionConfig(hidden=32, depth=2, heads=2, intermediate=48),
+        point_map=PointMapConfig(encoder="sim", width=32, depth=1),
+        motion=MotionTokenizerConfig(codes=16, code_dim=8, width=16, depth=1),
+    )
+    write_views(tmp_path / "views", 60)
+    save_model(build_model(cfg, build_processor(cfg, ["side lamp _1"] * 3, TYPES)), tmp_path / "model")
+    assert main([f"views={tmp_path / 'views'}", f"model={tmp_path / 'model'}", "rows=30"]) == 0
+    first, head, *lines = capsys.readouterr().out.splitlines()
+    assert "things in 30 views" in first
+    assert head.split() == ["x", "y", "z", "size"]
+    places = [line[:24].strip() for line in lines]
+    layers = range(cfg.text.layers)
+    assert places == ["points", *(f"visual tokens, layer {n}" for n in layers), *(f"name, layer {n}" for n in layers)]
