@@ -4,9 +4,9 @@
 
 Things in training views are asked about (on which side). Their position in the pelvis heading frame is predicted by ridge
 regression on what stands along the way: the points of the cells that show the thing, their visual tokens as the language model
-gets them and before each of its layers, and the last token of the thing's name before each layer. Printed is the share of the
-variance of x (forward), y (left) and z (up) that is explained for things kept back, and the size of what stands there: what is
-small beside the stream that it enters is lost in it.
+gets them and before each of its layers, and, before each layer, the last token of the thing's name and the token behind which
+the answer comes. Printed is the share of the variance of x (forward), y (left) and z (up) that is explained for things kept
+back, and the size of what stands there: what is small beside the stream that it enters is lost in it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from configs.arguments import command, read_arguments
-from proprio_mllm.model.batch import Batch, Collator, Example
+from proprio_mllm.model.batch import IGNORE, Batch, Collator, Example
 from proprio_mllm.model.building import load_model
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
@@ -69,7 +69,11 @@ def traced(model: ProprioMLLM, batch: Batch) -> dict[str, Tensor]:
     cells = named.first[:, None] + torch.arange(named.cells.shape[1])
     found |= {f"visual tokens, layer {number}": hidden[named.row[:, None], cells] for number, hidden in enumerate(read)}
     shown = {place: (values.float() * named.cells[..., None]).sum(1) for place, values in found.items()}
-    return shown | {f"name, layer {number}": hidden[named.row, named.place].float() for number, hidden in enumerate(read)}
+    later = torch.arange(batch.labels.shape[1]) > named.place[:, None]
+    answers = ((batch.labels[named.row] != IGNORE) & later).int().argmax(1) - 1
+    for text, places in (("name", named.place), ("answer", answers)):
+        shown |= {f"{text}, layer {number}": hidden[named.row, places].float() for number, hidden in enumerate(read)}
+    return shown
 
 
 def explained(values: Tensor, truth: Tensor) -> list[float]:

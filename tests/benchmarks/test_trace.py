@@ -40,4 +40,4 @@ def test_the_way_is_printed_place_by_place(tmp_path: Path, capsys: pytest.Captur
     assert head.split() == ["x", "y", "z", "size"]
     places = [line[:24].strip() for line in lines]
     layers = range(cfg.text.layers)
-    assert places == ["points", *(f"visual tokens, layer {n}" for n in layers), *(f"name, layer {n}" for n in layers)]
+    assert places == ["points", *(f"{what}, layer {n}" for what in ("visual tokens", "name", "answer") for n in layers)]
