@@ -293,7 +293,8 @@ class Collator:
             padding: side of the padding; by default left for generation, which needs it, else right.
 
         Raises:
-            ValueError: on an empty batch, a row that is too long, or views that do not match the messages.
+            ValueError: on an empty batch, a row that is too long, views that do not match the messages, or names that are not
+                in them.
         """
         if not examples:
             raise ValueError("no examples")
@@ -330,7 +331,10 @@ class Collator:
             first = at = ids.index(self.image_token)
             for shown in example.shown:
                 name = self.tokenizer(shown.name, add_special_tokens=False)["input_ids"]
-                at = next(k for k in range(at, len(ids)) if ids[k : k + len(name)] == name) + len(name)
+                starts = (k for k in range(at, len(ids)) if ids[k : k + len(name)] == name)
+                if (start := next(starts, None)) is None:
+                    raise ValueError(f"example {row} does not name {shown.name!r} where it should, behind its image")
+                at = start + len(name)
                 found.append((row, at - 1, first, shown))
         if not found:
             return None

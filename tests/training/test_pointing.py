@@ -1,5 +1,7 @@
 """The pointing head is taught by where things are, and its loss is that of the attention that the model computes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -93,3 +95,11 @@ def test_without_a_weight_nothing_is_added(asked: tuple[ProprioMLLM, Batch, list
     out, loss, metrics = Pointing(model, 0.0)(model, batch)
     assert loss is out.loss
     assert not metrics
+
+
+def test_a_name_that_is_not_there_is_refused(shards, cfg: ModelConfig, asked: tuple[ProprioMLLM, Batch, list[str]]) -> None:
+    views = Views(shards / "views", cfg)
+    example = looking_around(views, views.row(int(views.split.train[0])), 2, np.random.default_rng(0))
+    other = replace(example.shown[0], name=" sofa  _7")
+    with pytest.raises(ValueError, match="does not name ' sofa  _7'"):
+        Collator(asked[0].processor, cfg)([replace(example, shown=(other,))])

@@ -33,7 +33,7 @@ class AlignmentStage:
     name = "alignment"
     needs = ("base", "practice", "pointmap", "tokenizer")
     shards = ("lessons",)
-    recipe = 12
+    recipe = 13
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The phases and the variant's model."""
