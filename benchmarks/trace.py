@@ -20,6 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from configs.arguments import command, read_arguments
@@ -27,7 +28,7 @@ from proprio_mllm.model.batch import IGNORE, Batch, Collator, Example
 from proprio_mllm.model.building import load_model
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
-from proprio_mllm.training.sources import Views
+from proprio_mllm.training.sources import CELL, Asked, ViewRow, Views
 
 _TOGETHER: Final = 16
 #: Ridge penalties; of each the best counts, the same for all places.
@@ -49,11 +50,43 @@ class Options:
     rows: int = 200
 
 
-def traced(model: ProprioMLLM, batch: Batch) -> dict[str, Tensor]:
-    """What stands at each place on the way (K, features), for the K named things of a batch."""
-    named, images = batch.named, batch.images
-    assert named is not None
-    assert images is not None
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question about a thing in a view, and the share of the thing's pixels in each merged cell (N,), which add up to 1."""
+
+    row: ViewRow
+    asked: Asked
+    cells: NDArray[np.float32]
+
+    @staticmethod
+    def of(views: Views, row: ViewRow, asked: Asked) -> Question:
+        """The cells are those of the thing's box that show its type."""
+        left, top, right, bottom = map(int, asked.thing["bbox"])
+        mask = np.zeros(row.segmentation.shape, dtype=np.float32)
+        kind = views.type_names.index(str(asked.thing["id"]).rpartition("_")[0])
+        mask[top:bottom, left:right] = row.segmentation[top:bottom, left:right] == kind
+        height, width = (size // CELL for size in mask.shape)
+        cells = mask.reshape(height, CELL, width, CELL).sum((1, 3)).ravel()
+        return Question(row, asked, cells / cells.sum())
+
+    def example(self, views: Views) -> Example:
+        """The view and the question, alone, so that no other tells."""
+        return Example(looking([(self.asked.question, self.asked.answer)], None, views.style), (self.row.view,))
+
+
+def name_ends(model: ProprioMLLM, batch: Batch, questions: Sequence[Question]) -> list[int]:
+    """Position (K,) of the last token of each name, one question per row."""
+    ends: list[int] = []
+    for ids, question in zip(batch.input_ids.tolist(), questions, strict=True):
+        name: list[int] = model.processor.tokenizer(f" {question.asked.name.lstrip()}", add_special_tokens=False)["input_ids"]
+        ends.append(next(end for end in range(len(ids), 0, -1) if ids[end - len(name) : end] == name) - 1)
+    return ends
+
+
+def traced(model: ProprioMLLM, questions: Sequence[Question], views: Views) -> dict[str, Tensor]:
+    """What stands at each place on the way (K, features), for K questions."""
+    batch = Collator(model.processor, model.cfg)([question.example(views) for question in questions])
+    assert batch.images is not None
     layers: Any = model.core.model.language_model.layers
     read: list[Tensor] = []
 
@@ -63,16 +96,16 @@ def traced(model: ProprioMLLM, batch: Batch) -> dict[str, Tensor]:
     handles = [layer.register_forward_pre_hook(keep, with_kwargs=True) for layer in layers]
     with torch.no_grad():
         model(batch)
-        found = {"points": model.spatial(images)[named.row]} if model.cse is not None else {}
+        found = {"points": model.spatial(batch.images)} if model.cse is not None else {}
     for handle in handles:
         handle.remove()
-    cells = named.first[:, None] + torch.arange(named.cells.shape[1])
-    found |= {f"visual tokens, layer {number}": hidden[named.row[:, None], cells] for number, hidden in enumerate(read)}
-    shown = {place: (values.float() * named.cells[..., None]).sum(1) for place, values in found.items()}
-    later = torch.arange(batch.labels.shape[1]) > named.place[:, None]
-    answers = ((batch.labels[named.row] != IGNORE) & later).int().argmax(1) - 1
-    for text, places in (("name", named.place), ("answer", answers)):
-        shown |= {f"{text}, layer {number}": hidden[named.row, places].float() for number, hidden in enumerate(read)}
+    rows, cells = torch.arange(len(questions)), torch.from_numpy(np.stack([question.cells for question in questions]))
+    seen = batch.input_ids == batch.input_ids.new_tensor(Collator(model.processor, model.cfg).image_token)
+    found |= {f"visual tokens, layer {number}": hidden[seen].unflatten(0, cells.shape) for number, hidden in enumerate(read)}
+    shown = {place: (values.float() * cells[..., None]).sum(1) for place, values in found.items()}
+    answers = (batch.labels != IGNORE).int().argmax(1) - 1
+    for text, places in (("name", torch.tensor(name_ends(model, batch, questions))), ("answer", answers)):
+        shown |= {f"{text}, layer {number}": hidden[rows, places].float() for number, hidden in enumerate(read)}
     return shown
 
 
@@ -94,18 +127,16 @@ def main(arguments: Sequence[str]) -> int:
     """Prints the table."""
     options = read_arguments(Options, arguments)
     model = load_model(Path(options.model)).eval()
-    views, collator, rng = Views(Path(options.views), model.cfg), Collator(model.processor, model.cfg), np.random.default_rng(0)
-    held, truth, examples = defaultdict[str, list[Tensor]](list), list[Any](), list[Example]()
-    for index in rng.choice(views.split.train, min(options.rows, len(views.split.train)), replace=False):
-        row = views.row(int(index))
-        if asked := views.asked(row, ("side",), 8, rng):
-            pairs = [(one.question, one.answer) for one in asked]
-            examples.append(Example(looking(pairs, None, views.style), (row.view,), shown=views.shown(row, asked)))
-            truth += [one.thing["center_in_pelvis"] for one in asked]
-    for first in range(0, len(examples), _TOGETHER):
-        for place, values in traced(model, collator(examples[first : first + _TOGETHER])).items():
+    views, rng = Views(Path(options.views), model.cfg), np.random.default_rng(0)
+    held, questions = defaultdict[str, list[Tensor]](list), list[Question]()
+    rows = rng.choice(views.split.train, min(options.rows, len(views.split.train)), replace=False)
+    for row in (views.row(int(index)) for index in rows):
+        questions += [Question.of(views, row, one) for one in views.asked(row, ("side",), 8, rng)]
+    truth = [question.asked.thing["center_in_pelvis"] for question in questions]
+    for first in range(0, len(questions), _TOGETHER):
+        for place, values in traced(model, questions[first : first + _TOGETHER], views).items():
             held[place].append(values)
-    sys.stdout.write(f"{len(truth)} things in {len(examples)} views\n{'':24} {'x':>6} {'y':>6} {'z':>6} {'size':>8}\n")
+    sys.stdout.write(f"{len(truth)} things in {len(rows)} views\n{'':24} {'x':>6} {'y':>6} {'z':>6} {'size':>8}\n")
     for place, values in held.items():
         whole = torch.cat(values)
         shares = " ".join(f"{share:6.2f}" for share in explained(whole, torch.tensor(truth, dtype=torch.float32)))

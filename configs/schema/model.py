@@ -41,6 +41,8 @@ class CseConfig:
         literal: the equation as printed; otherwise F2D is added as a residual and the MLP's last layer starts at zero.
         frame: frame of the points: the camera's, or the robot's pelvis heading frame through its own kinematics.
         hidden: width of the MLP; 0 takes the language model's.
+        named: whether words behind a picture get F3D of what they name (`proprio_mllm.model.cse.NamedPoints`); for models
+            whose visual tokens are tied to names by stage `base`.
     """
 
     enabled: bool = True
@@ -48,6 +50,7 @@ class CseConfig:
     literal: bool = False
     frame: Literal["camera", "pelvis"] = "pelvis"
     hidden: int = 0
+    named: bool = False
 
 
 @dataclass(frozen=True)

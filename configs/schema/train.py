@@ -78,7 +78,6 @@ class BaseConfig:
         text_share: share of episodes in words among them.
         judge_share: share of judging questions and phrases among the others.
         dense_weight: weight of the dense loss on the joint batches' views.
-        point_weight: weight of their pointing loss (`proprio_mllm.training.pointing`).
     """
 
     dense: LoopConfig
@@ -88,7 +87,6 @@ class BaseConfig:
     text_share: float = 0.5
     judge_share: float = 0.15
     dense_weight: float = 0.5
-    point_weight: float = 0.0
 
     def __post_init__(self) -> None:
         _require_shares(self, "plan_share", "text_share", "judge_share")
@@ -155,7 +153,6 @@ class AlignmentConfig:
         judge_share: share of judging questions among the decisions.
         questions: body-relative questions packed per image.
         mask: share of motion tokens hidden in masked motion.
-        point_weight: weight of the pointing loss on questions about views; for models that have not learnt to point.
     """
 
     text: LoopConfig
@@ -166,7 +163,6 @@ class AlignmentConfig:
     judge_share: float = 0.15
     questions: int = 6
     mask: float = 0.3
-    point_weight: float = 0.0
 
     def __post_init__(self) -> None:
         _require_shares(self, "plan_share", "text_share", "judge_share", "mask")

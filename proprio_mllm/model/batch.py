@@ -32,6 +32,8 @@ from proprio_mllm.model.processor import ProprioProcessor
 from proprio_mllm.model.vocabulary import MOTION_END, MOTION_START
 
 IGNORE = -100
+#: Tokens before a row that may begin a name in it.
+TOLD = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,19 +54,6 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
-    """Where a thing that a conversation names is in its picture.
-
-    Attributes:
-        name: as the text has it at its next mention, with the blank before it.
-        cells: (N,) share of the thing's pixels in each merged cell, raster order; they add up to 1.
-    """
-
-    name: str
-    cells: NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True)
 class Example:
     """A conversation, or a sequence that is tokens already, and its views in the order of its images.
 
@@ -73,14 +62,12 @@ class Example:
         views: one per image.
         tokens: the sequence, one pad per image.
         start: position of its first token, where what stands before it has been read already.
-        shown: where things are in its only picture, in the order in which it names them.
     """
 
     messages: tuple[Message, ...] = ()
     views: tuple[View, ...] = ()
     tokens: Encoded | None = None
     start: int = 0
-    shown: tuple[Shown, ...] = ()
 
     @property
     def length(self) -> int:
@@ -142,20 +129,22 @@ class Logs(Movable):
 
 
 @dataclass(frozen=True, slots=True)
-class Named(Movable):
-    """Names of things in a batch, K of them, and where the things are seen (`proprio_mllm.training.pointing`).
+class Sight(Movable):
+    """What a model has made of the pictures of a batch (`ProprioMLLM.look`); rows that go on still have it.
 
     Attributes:
-        row: (K,) row of the batch.
-        place: (K,) position of the last token of the name.
-        first: (K,) position of the row's first visual token.
-        cells: (K, N) from `Shown`.
+        visual: (I, N, D) F2D.
+        tokens: (I, N, D) what the language model reads.
+        spatial: (I, N, F) F3D where words look it up, or None.
+        last: (B,) the last picture of each row, -1 where there is none.
+        before: (B, K) the last tokens before the rows.
     """
 
-    row: Tensor
-    place: Tensor
-    first: Tensor
-    cells: Tensor
+    visual: Tensor
+    tokens: Tensor
+    spatial: Tensor | None
+    last: Tensor
+    before: Tensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +159,7 @@ class Batch(Movable):
         images: the images of all rows in order, or None.
         out_of: supervised tokens of the whole batch of which it is a part, 0 where it is one by itself.
         logs: what stands before the rows, in the order of the rows; None where each row is all there is.
-        named: names whose things are known to be in the pictures, or None.
+        sight: what a model has made of the images of these rows, or of what stands before them.
     """
 
     input_ids: Tensor
@@ -180,13 +169,16 @@ class Batch(Movable):
     images: ImageBatch | None = None
     out_of: int = 0
     logs: Logs | None = None
-    named: Named | None = None
+    sight: Sight | None = None
 
     def then(self, tokens: Tensor) -> Batch:
         """More text (B, K) after each left-padded row, where a cache holds the rows."""
         mask = torch.cat([self.attention_mask, self.attention_mask.new_ones(tokens.shape)], dim=1)
         after = torch.arange(1, tokens.shape[1] + 1, device=self.position_ids.device)
-        return Batch(tokens, mask, self.position_ids[:, :, -1:] + after, tokens)
+        sight = self.sight
+        if sight is not None:
+            sight = replace(sight, before=torch.cat([sight.before, self.input_ids], dim=1)[:, -TOLD:])
+        return Batch(tokens, mask, self.position_ids[:, :, -1:] + after, tokens, sight=sight)
 
     @property
     def supervised(self) -> int:
@@ -293,8 +285,7 @@ class Collator:
             padding: side of the padding; by default left for generation, which needs it, else right.
 
         Raises:
-            ValueError: on an empty batch, a row that is too long, views that do not match the messages, or names that are not
-                in them.
+            ValueError: on an empty batch, a row that is too long, or views that do not match the messages.
         """
         if not examples:
             raise ValueError("no examples")
@@ -319,28 +310,7 @@ class Collator:
             self._put_beside(ids, labels, where)
             rows.append((ids, labels, where))
             first += named
-        batch = self._pad(rows, images, side)
-        return replace(batch, named=self._named(batch.input_ids, examples))
-
-    def _named(self, input_ids: Tensor, examples: Sequence[Example]) -> Named | None:
-        found: list[tuple[int, int, int, Shown]] = []
-        for row, example in enumerate(examples):
-            if not example.shown:
-                continue
-            ids = input_ids[row].tolist()
-            first = at = ids.index(self.image_token)
-            for shown in example.shown:
-                name = self.tokenizer(shown.name, add_special_tokens=False)["input_ids"]
-                starts = (k for k in range(at, len(ids)) if ids[k : k + len(name)] == name)
-                if (start := next(starts, None)) is None:
-                    raise ValueError(f"example {row} does not name {shown.name!r} where it should, behind its image")
-                at = start + len(name)
-                found.append((row, at - 1, first, shown))
-        if not found:
-            return None
-        row, place, first, shown = zip(*found, strict=True)
-        cells = torch.from_numpy(np.stack([one.cells for one in shown]))
-        return Named(torch.tensor(row), torch.tensor(place), torch.tensor(first), cells)
+        return self._pad(rows, images, side)
 
     def _put_beside(self, ids: Sequence[int], labels: Sequence[int], where: Tensor) -> None:
         """Moves the positions (3, S) of motion that is not learnt, and of what follows it, back by the motion's length."""

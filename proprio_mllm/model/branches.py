@@ -151,7 +151,15 @@ def _past(length: int, like: Tensor) -> Tensor:
     return torch.full((length, length), -torch.inf, dtype=like.dtype, device=like.device).triu(1)
 
 
-def read_branches(model: Any, input_ids: Tensor, position_ids: Tensor, layout: Branches, kept: Tensor, **inputs: Any) -> Tensor:
+def read_branches(
+    model: Any,
+    input_ids: Tensor,
+    position_ids: Tensor,
+    layout: Branches,
+    kept: Tensor,
+    added: Tensor | None = None,
+    **inputs: Any,
+) -> Tensor:
     """Last hidden states of rows with branches.
 
     Args:
@@ -160,15 +168,20 @@ def read_branches(model: Any, input_ids: Tensor, position_ids: Tensor, layout: B
         position_ids: (B, S), or (3, B, S).
         layout: where the branches are.
         kept: (B, S) tokens that are no padding; of each log and each branch, the first ones.
+        added: (B, S, hidden) what is added to the embeddings of the tokens.
         inputs: what else the model takes.
 
     Returns:
         (B, S, hidden); what it holds of padding means nothing.
     """
     line = _Line.of(layout, kept)
+    ids = input_ids.flatten()[line.slots][None]
+    if added is not None:
+        embedded = model.get_input_embeddings()(ids)
+        inputs["inputs_embeds"] = embedded + line.line(added)[None].to(embedded.dtype)
     with _own_attention(getattr(model, "language_model", model)):
         hidden = model(
-            input_ids=input_ids.flatten()[line.slots][None],
+            input_ids=ids,
             attention_mask={"full_attention": line},
             position_ids=position_ids.flatten(-2)[..., line.slots].unsqueeze(-2),
             use_cache=False,

@@ -5,7 +5,13 @@ here is bilinear interpolation of the tokens to the merged grid, mean points of 
 map. As printed the equation destroys pretrained visual tokens at the start, so by default F2D is added as a residual and the
 MLP's last layer starts at zero (off and on are equal at the start); `literal` gives the equation as printed.
 
-Shape letters: I images, h and w rows and columns of the merged grid, N = h * w, D hidden size, C token channels.
+What CSE adds to a visual token is of use only to a language model that finds the token by the name of a thing. The released
+Qwen2.5-VL does; a small one that is trained from nothing did not learn to (docs/model.md). So beyond the paper, F3D can be
+looked up by name (`NamedPoints`): a word behind a picture gets F3D of the cells that look like it, since dense pretraining ties
+visual tokens to names (`proprio_mllm.model.dense`).
+
+Shape letters: I images, h and w rows and columns of the merged grid, N = h * w, D hidden size, C token channels, B rows of W
+words.
 """
 
 from __future__ import annotations
@@ -19,6 +25,8 @@ from proprio_mllm.model.point_map import GeoFeatures
 
 #: Points beyond this are held to it, metres.
 FAR_M = 10.0
+#: Most words of a name.
+NAME_WORDS = 3
 
 
 class CrossSpatialEncoder(nn.Module):
@@ -44,6 +52,7 @@ class CrossSpatialEncoder(nn.Module):
             assert isinstance(last, nn.Linear)
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
+        self.named = NamedPoints(inputs, hidden) if cfg.named else None
 
     def spatial(self, geo: GeoFeatures, h: int, w: int, camera_in_pelvis: Tensor | None) -> Tensor:
         """F3D on the merged grid, (I, N, inputs of Phi).
@@ -84,3 +93,42 @@ class CrossSpatialEncoder(nn.Module):
         own = self.phi.weight.dtype  # stays in float32 under a backbone in half precision
         out = self.mlp(features.to(own) + self.phi(spatial.to(own))).to(features.dtype)
         return out if self.cfg.literal else features + out
+
+
+class NamedPoints(nn.Module):
+    """What words get of a picture that shows what they name.
+
+    A word's cosine with F2D, by itself or together with up to `NAME_WORDS - 1` words before it, whichever is larger, tells
+    which cells show it: F3D is their mean, and passes an MLP and a gate that opens where the cosine is large.
+
+    Args:
+        inputs: channels of F3D.
+        hidden: D.
+    """
+
+    def __init__(self, inputs: int, hidden: int) -> None:
+        super().__init__()
+        # dense pretraining gives cosines of .25 to .55 to what is seen, below .15 to what is not and to other words
+        self.scale = nn.Parameter(torch.tensor(20.0).log())
+        self.bias = nn.Parameter(torch.tensor(-5.0))
+        self.put = nn.Sequential(nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, hidden))
+
+    def forward(self, words: Tensor, visual: Tensor, spatial: Tensor) -> Tensor:
+        """What is added to the embeddings of words (B, W, D).
+
+        Args:
+            words: (B, W, D) rows of the language model's table, one word after the other.
+            visual: (B, N, D) F2D of the picture that each row sees.
+            spatial: (B, N, inputs) F3D.
+        """
+        own = self.scale.dtype
+        rows = words.to(own)
+        spans = [rows]
+        for count in range(1, min(NAME_WORDS, rows.shape[1])):
+            spans.append(spans[-1] + functional.pad(rows[:, :-count], (0, 0, count, 0)))
+        unit = functional.normalize(torch.stack(spans), dim=-1)  # (spans, B, W, D)
+        cosine = unit @ functional.normalize(visual.to(own), dim=-1).mT  # (spans, B, W, N)
+        best = cosine.amax(-1).argmax(0)  # (B, W)
+        scores = cosine.gather(0, best[None, ..., None].expand(1, *cosine.shape[1:]))[0].float() * self.scale.exp()
+        gate = (scores.amax(-1, keepdim=True) + self.bias).sigmoid()
+        return gate * self.put(scores.softmax(-1).to(own) @ spatial.to(own))

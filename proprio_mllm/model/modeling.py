@@ -1,7 +1,8 @@
 """Proprio-MLLM: Qwen2.5-VL with MPE and CSE, a wrapper that hands visual tokens and position ids to the unchanged model.
 
 The wrapper computes the visual tokens, passes them through the CSE and the additive MPE, and gives them to the model as
-`mm_encoder_outputs` together with position ids from the collator. With `mpe.mode=mrope` and `cse.enabled=false` the result is
+`mm_encoder_outputs` together with position ids from the collator. With `cse.named`, words behind a picture get F3D of what they
+name, in training and as they are written. With `mpe.mode=mrope` and `cse.enabled=false` the result is
 the base model's, bit for bit but for the patch embedding (`backbone.PatchEmbedding`).
 
 Shape letters: B batch, S sequence, I images, N visual tokens per image, D hidden size, V vocabulary.
@@ -10,7 +11,7 @@ Shape letters: B batch, S sequence, I images, N visual tokens per image, D hidde
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -21,12 +22,13 @@ from transformers import Cache, DynamicCache, Qwen2_5_VLForConditionalGeneration
 from transformers.modeling_outputs import BaseModelOutputWithPooling
 
 from configs.schema.model import ModelConfig
-from proprio_mllm.model.batch import IGNORE, Batch, ImageBatch
+from proprio_mllm.model.batch import IGNORE, Batch, ImageBatch, Sight
 from proprio_mllm.model.branches import Branches, read_branches
 from proprio_mllm.model.cse import CrossSpatialEncoder
 from proprio_mllm.model.mpe import SignEmbedding
 from proprio_mllm.model.processor import ProprioProcessor
 from proprio_mllm.model.spatial_cache import SpatialCache
+from proprio_mllm.model.word_tokens import first_word
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +96,7 @@ class ProprioMLLM(nn.Module):
         self._never = [*tokenizer.convert_tokens_to_ids(list(names)), *range(len(tokenizer), rows)]
         self._end = int(tokenizer.convert_tokens_to_ids("<|im_end|>"))
         self._pad = int(tokenizer.pad_token_id)
+        self._image = int(tokenizer.convert_tokens_to_ids(processor.image_token))
 
     @property
     def core(self) -> Qwen2_5_VLForConditionalGeneration:
@@ -125,14 +128,39 @@ class ProprioMLLM(nn.Module):
         features = model.get_image_features(images.pixel_values, images.grid_thw, return_dict=True)
         return torch.stack(features.pooler_output)
 
-    def enrich(self, visual: Tensor, images: ImageBatch) -> Tensor:
-        """Visual tokens (I, N, D) after CSE and the additive MPE."""
-        h, w = images.grid
+    def look(self, batch: Batch) -> Batch:
+        """The batch with what the model makes of its images; to be called once, before rows go on by `Batch.then`."""
+        if batch.images is None or batch.sight is not None:
+            return batch
+        images, (h, w) = batch.images, batch.images.grid
+        visual = tokens = self.visual_tokens(images)
+        spatial = None if self.cse is None else self.spatial(images)
         if self.cse is not None:
-            visual = self.cse(visual, self.spatial(images))
+            assert spatial is not None
+            tokens = self.cse(tokens, spatial)
         if self.mpe is not None:
-            visual = visual + torch.stack([self.mpe(h, w, place) for place in images.centroids]).to(visual.dtype)
-        return visual
+            tokens = tokens + torch.stack([self.mpe(h, w, place) for place in images.centroids]).to(tokens.dtype)
+        count = (batch.input_ids == self._image).sum(1) // visual.shape[1]
+        last = (count.cumsum(0) - 1).masked_fill(count == 0, -1)
+        looks_up = self.cse is not None and self.cse.named is not None
+        return replace(batch, sight=Sight(visual, tokens, spatial if looks_up else None, last, batch.input_ids[:, :0]))
+
+    def named(self, batch: Batch) -> Tensor | None:
+        """What the words of a batch get of the last picture before them (B, S, D), or None where nothing is looked up."""
+        sight = batch.sight
+        if sight is None or sight.spatial is None:
+            return None
+        assert self.cse is not None and self.cse.named is not None
+        ids = torch.cat([sight.before, batch.input_ids], dim=1)
+        seen = ids == self._image
+        behind = (seen.flip(1).cumsum(1).flip(1) == 0) & (sight.last >= 0)[:, None]
+        words = behind & (ids >= first_word(self.processor.tokenizer))
+        most = int(words.sum(1).max())
+        order = (~words).int().argsort(dim=1, stable=True)[:, :most]  # where the words of each row are
+        rows = self.table.detach()[ids.gather(1, order)] * words.gather(1, order)[..., None]
+        given = self.cse.named(rows, sight.visual[sight.last], sight.spatial[sight.last]) * words.gather(1, order)[..., None]
+        place = order[..., None].expand(-1, -1, rows.shape[2])
+        return given.new_zeros(*ids.shape, rows.shape[2]).scatter(1, place, given)[:, sight.before.shape[1] :]
 
     def keep_spatial(self) -> None:
         """From now on, what the point map makes of an image is kept (`spatial_cache`)."""
@@ -147,19 +175,24 @@ class ProprioMLLM(nn.Module):
             return self.cse.spatial(self.point_map(images.rgb, images.points_m), *images.grid, images.camera_in_pelvis)
         return self.seen.spatial(self.cse, self.point_map, images)
 
-    def _inputs(self, batch: Batch) -> tuple[dict[str, Any], Tensor | None]:
+    def _inputs(self, batch: Batch) -> dict[str, Any]:
         inputs: dict[str, Any] = {
             "input_ids": batch.input_ids,
             "attention_mask": batch.attention_mask,
             "position_ids": batch.position_ids,
         }
-        if batch.images is None:
-            return inputs, None
-        visual = self.visual_tokens(batch.images)
-        tokens = self.enrich(visual, batch.images)
-        per_image: Any = tuple(tokens)  # one entry per image, as Qwen2.5-VL returns it
-        inputs["mm_encoder_outputs"] = {"image": BaseModelOutputWithPooling(pooler_output=per_image)}
-        return inputs, visual
+        if batch.images is not None:
+            assert batch.sight is not None
+            per_image: Any = tuple(batch.sight.tokens)  # one entry per image, as Qwen2.5-VL returns it
+            inputs["mm_encoder_outputs"] = {"image": BaseModelOutputWithPooling(pooler_output=per_image)}
+        given = self.named(batch)
+        if given is not None and batch.logs is None:
+            embeddings: Any = self.core.get_input_embeddings()
+            embedded = embeddings(batch.input_ids)
+            inputs["inputs_embeds"] = embedded + given.to(embedded.dtype)
+        elif given is not None:
+            inputs["added"] = given
+        return inputs
 
     def forward(self, batch: Batch, return_logits: bool = False) -> ModelOutput:
         """Loss of a batch; of a part of one, what it adds to the whole batch's.
@@ -168,7 +201,8 @@ class ProprioMLLM(nn.Module):
             batch: from the collator.
             return_logits: also compute the logits of every position.
         """
-        inputs, visual = self._inputs(batch)
+        batch = self.look(batch)
+        inputs = self._inputs(batch)
         if bool((batch.attention_mask.diff(dim=1) <= 0).all()):
             # Padding stands right of every token, where causal attention never looks: no mask, and the fast kernel.
             inputs["attention_mask"] = None
@@ -182,7 +216,7 @@ class ProprioMLLM(nn.Module):
         loss = functional.cross_entropy(logits, picked, reduction="sum") / max(batch.out_of or count, 1)
         correct = int((logits.detach().argmax(-1) == picked).sum()) if count else 0
         everything = self.core.lm_head(hidden) if return_logits else None
-        return ModelOutput(loss, count, correct, visual, everything)
+        return ModelOutput(loss, count, correct, None if batch.sight is None else batch.sight.visual, everything)
 
     def _beside(self, batch: Batch, inputs: Mapping[str, Any]) -> Tensor:
         """Last hidden states (B, S, D) of rows that go on from logs."""
@@ -192,13 +226,17 @@ class ProprioMLLM(nn.Module):
         def joined(before: Tensor, rows: Tensor) -> Tensor:  # (E, M) and (E * N, S) to (E, M + N * S)
             return torch.cat([before, rows.unflatten(-2, (logs, turns)).flatten(-2)], -1)
 
+        more = {name: inputs[name] for name in ("mm_encoder_outputs", "added") if name in inputs}
+        if "added" in more:
+            rows = more["added"].unflatten(0, (logs, turns)).flatten(1, 2)  # (E, N * S, D)
+            more["added"] = functional.pad(rows, (0, 0, size, 0))
         hidden = read_branches(
             self.core.model,
             joined(batch.logs.ids, batch.input_ids),
             joined(torch.arange(size, device=self.device).expand(3, logs, size), batch.position_ids),
             Branches(size, batch.logs.read),
             joined(batch.logs.kept, batch.attention_mask > 0),
-            **({"mm_encoder_outputs": inputs["mm_encoder_outputs"]} if batch.images is not None else {}),
+            **more,
         )
         return hidden[:, size:].unflatten(1, (turns, -1)).flatten(0, 1)
 
@@ -207,10 +245,11 @@ class ProprioMLLM(nn.Module):
         """Scores (B, V) of what follows each row.
 
         Args:
-            batch: left-padded rows; their attention mask covers what the cache holds too, where any of it is padding.
+            batch: left-padded rows that have been looked at (`look`); their attention mask covers what the cache holds too,
+                where any of it is padding.
             cache: what was read before; takes in the rows.
         """
-        inputs, _ = self._inputs(batch)
+        inputs = self._inputs(batch)
         if bool(batch.attention_mask.all()):
             inputs["attention_mask"] = None
         out = self.core.model(**inputs, past_key_values=cache, use_cache=True)
@@ -244,7 +283,7 @@ class ProprioMLLM(nn.Module):
             raise ValueError(f"temperature {temperature} must not be negative")
         if int(batch.attention_mask[:, -1].min()) == 0:
             raise ValueError("generation needs left padding: the last position of a row is padding")
-        cache = DynamicCache()
+        batch, cache = self.look(batch), DynamicCache()
         replies: list[list[int]] = [[] for _ in range(len(batch.input_ids))]
         done = torch.zeros(len(replies), dtype=torch.bool, device=batch.input_ids.device)
         for _ in range(max_new_tokens):

@@ -200,14 +200,15 @@ class WordsPlanner:
         for answer in answers:
             answer.skip()
         batch = self._collator([answer.example(0 if state is None else state.cached) for answer in answers], padding="left")
+        batch = self.model.look(batch.to(self.model.device))
         while True:
-            scores = self.model.following(batch.to(self.model.device), cache).cpu()
+            scores = self.model.following(batch, cache).cpu()
             taken = [answer.choose(row, self.temperature) for answer, row in zip(answers, scores, strict=True)]
             if state is not None:  # in a batch all rows grow by as much
                 taken[0] += answers[0].skip()
             if all(answer.ended for answer in answers):
                 break
-            batch = batch.then(torch.tensor([tokens or [self._pad] for tokens in taken]))
+            batch = batch.then(torch.tensor([tokens or [self._pad] for tokens in taken], device=self.model.device))
         if state is not None:
             state.cached = len(state.log)
             state.cache.crop(state.cached - state.cache.get_seq_length())  # minus what is no log

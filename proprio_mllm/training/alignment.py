@@ -39,7 +39,6 @@ from proprio_mllm.training.base import EPISODE_ROWS, looking_around
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.phrases import body_state_words
-from proprio_mllm.training.pointing import Pointing
 from proprio_mllm.training.sources import Clips, Demos, Views, grips_of
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordBatch, WordsObjective
@@ -183,7 +182,6 @@ class AlignmentObjective(Objective):
         self.key = key
         kinds = PHASES[phase].kinds
         self._data, self._cfg = data, cfg
-        self._pointing = Pointing(model, cfg.point_weight)
         self._kinds: tuple[Kind, ...] = kinds if model.cfg.proprioception else ("body", "plan")
 
     def kind(self, rng: np.random.Generator) -> Kind:
@@ -211,6 +209,5 @@ class AlignmentObjective(Objective):
         if isinstance(batch, WordBatch):
             return self._data.words.loss(module, batch, generator)
         kind, inputs = batch
-        out, loss, pointed = self._pointing(module, inputs)
-        accuracy = out.correct / max(inputs.out_of, 1)
-        return loss, pointed | {f"{kind}_loss": float(out.loss.detach()), f"{kind}_accuracy": accuracy}
+        out = module(inputs)
+        return out.loss, {f"{kind}_loss": float(out.loss.detach()), f"{kind}_accuracy": out.correct / max(inputs.out_of, 1)}

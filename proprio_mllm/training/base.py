@@ -25,7 +25,6 @@ from proprio_mllm.training.asking import answer_shares
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.phrases import phrase
-from proprio_mllm.training.pointing import Pointing
 from proprio_mllm.training.sources import BODY_RELATIVE, CELL, GROUNDING, Clips, Demos, ViewRow, Views
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordBatch, WordsObjective
@@ -39,20 +38,19 @@ PHRASES: Final = 0.1
 class _WithDense(nn.Module):
     """Model and dense head as one module, so that one optimiser and one checkpoint hold both."""
 
-    def __init__(self, model: ProprioMLLM, head: DenseHead, point_weight: float) -> None:
+    def __init__(self, model: ProprioMLLM, head: DenseHead) -> None:
         super().__init__()
         self.model = model
         self.head = head
-        self._pointing = Pointing(model, point_weight)
 
     def forward(self, batch: _JointBatch) -> tuple[Tensor, dict[str, float]]:
         values: dict[str, float] = {}
         total: Tensor | None = None
         if batch.text is not None:
-            out, total, pointed = self._pointing(self.model, batch.text)
+            out = self.model(batch.text)
             accuracy = out.correct / max(batch.text.out_of or out.supervised, 1)
-            values |= pointed | {f"{batch.kind}_loss": float(out.loss.detach()), f"{batch.kind}_accuracy": accuracy}
-            visual = out.visual
+            values |= {f"{batch.kind}_loss": float(out.loss.detach()), f"{batch.kind}_accuracy": accuracy}
+            visual, total = out.visual, out.loss
         else:
             assert batch.images is not None
             visual = self.model.visual_tokens(batch.images)
@@ -81,7 +79,7 @@ class _Base(Objective):
     """What both objectives share: the sources and the assembly of view batches."""
 
     def __init__(self, model: ProprioMLLM, head: DenseHead, views: Views, cfg: BaseConfig, key: str) -> None:
-        self.module: nn.Module = _WithDense(model, head, cfg.point_weight)
+        self.module: nn.Module = _WithDense(model, head)
         self._model = model
         self.key = key
         self._views, self._cfg = views, cfg
@@ -195,7 +193,7 @@ def looking_around(
     codes: Sequence[int] | None = None,
     listing: bool = False,
 ) -> Example:
-    """Questions about the things in a view, with where they are in it.
+    """Questions about the things in a view.
 
     Args:
         views: asks.
@@ -208,7 +206,7 @@ def looking_around(
     asked = views.asked(row, (*GROUNDING, *BODY_RELATIVE), questions, rng)
     pairs = [(one.question, one.answer) for one in asked]
     pairs += [views.listing(row)] if listing or not pairs else []
-    return Example(looking(pairs, codes, views.style), (row.view,), shown=views.shown(row, asked))
+    return Example(looking(pairs, codes, views.style), (row.view,))
 
 
 @torch.no_grad()

@@ -24,7 +24,7 @@ from configs.schema.model import ModelConfig
 from data.motion import HAND_OPENING, KEY_BODY_COUNT, OPEN_HAND
 from data.shards import Manifest, ShardError, ShardReader, decode_depth, decode_motion, decode_png, decode_segmentation
 from interface.observation import Camera
-from proprio_mllm.model.batch import Shown, View
+from proprio_mllm.model.batch import View
 from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, answers
@@ -142,19 +142,6 @@ class Views:
             found.append(Asked(ask(kind, name, self.style), ANSWERS[kind](centre, bodies), name, obj))
         order = rng.permutation(len(found))[:count]
         return [found[i] for i in order]
-
-    def shown(self, row: ViewRow, asked: Sequence[Asked]) -> tuple[Shown, ...]:
-        """Where the things are that are asked about."""
-        height, width = (size // CELL for size in row.segmentation.shape)
-        found: list[Shown] = []
-        for one in asked:
-            left, top, right, bottom = map(int, one.thing["bbox"])
-            mask = np.zeros(row.segmentation.shape, dtype=np.float32)
-            kind = self.type_names.index(str(one.thing["id"]).rpartition("_")[0])
-            mask[top:bottom, left:right] = row.segmentation[top:bottom, left:right] == kind
-            cells = mask.reshape(height, CELL, width, CELL).sum((1, 3)).ravel()
-            found.append(Shown(f" {one.name.lstrip()}", cells / cells.sum()))
-        return tuple(found)
 
     def listing(self, row: ViewRow) -> tuple[str, str]:
         """Image to text: the names of the objects in view, nearest to the top-left corner first."""

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.trace import explained, main, traced
+from benchmarks.trace import Question, explained, main, name_ends, traced
 from configs.schema.model import ModelConfig, MotionTokenizerConfig, PointMapConfig, TinyTextConfig, TinyVisionConfig
 from proprio_mllm.model.batch import IGNORE, Collator
 from proprio_mllm.model.building import build_model, build_processor, save_model
 from proprio_mllm.model.modeling import ProprioMLLM
-from proprio_mllm.training.base import looking_around
-from proprio_mllm.training.sources import Views
+from proprio_mllm.training.sources import CELL, Views
 from tests.training.conftest import TYPES, write_views
 
 
@@ -43,17 +42,33 @@ def model() -> ProprioMLLM:
 
 def test_names_and_what_stands_before_their_answers_are_read(tmp_path: Path, model: ProprioMLLM) -> None:
     views = Views(write_views(tmp_path / "views", 10), model.cfg)
-    examples = [looking_around(views, views.row(i), 3, np.random.default_rng(0)) for i in views.split.train[:3]]
-    batch = Collator(model.processor, model.cfg)(examples)
-    found = traced(model, batch)
-    for k, (row, place) in enumerate(zip(batch.named.row.tolist(), batch.named.place.tolist(), strict=True)):
-        answer = next(at for at in range(place, batch.labels.shape[1]) if batch.labels[row, at] != IGNORE)
-        ids = batch.input_ids[row]
+    rng = np.random.default_rng(0)
+    rows = [views.row(int(i)) for i in views.split.train[:3]]
+    questions = [Question.of(views, row, one) for row in rows for one in views.asked(row, ("side",), 3, rng)]
+    batch = model.look(Collator(model.processor, model.cfg)([question.example(views) for question in questions]))
+    found = traced(model, questions, views)
+    for k, (question, ids, place) in enumerate(
+        zip(questions, batch.input_ids, name_ends(model, batch, questions), strict=True)
+    ):
+        answer = next(at for at in range(place, len(ids)) if batch.labels[k, at] != IGNORE)
+        asked = model.processor.tokenizer.decode(ids[: place + 1]).rpartition("<|im_start|>user")[2]
+        assert asked.endswith(question.asked.name)
         torch.testing.assert_close(found["name, layer 0"][k], model.table[ids[place]].detach())
         torch.testing.assert_close(found["answer, layer 0"][k], model.table[ids[answer - 1]].detach())
-    visual = model.enrich(model.visual_tokens(batch.images), batch.images).detach()
-    expected = (visual[batch.named.row] * batch.named.cells[..., None]).sum(1)
-    torch.testing.assert_close(found["visual tokens, layer 0"], expected)
+    cells = torch.tensor(np.stack([question.cells for question in questions]))
+    torch.testing.assert_close(found["visual tokens, layer 0"], (batch.sight.tokens.detach() * cells[..., None]).sum(1))
+
+
+def test_things_are_where_their_boxes_are(tmp_path: Path, model: ProprioMLLM) -> None:
+    views = Views(write_views(tmp_path / "views", 6), model.cfg)
+    row = views.row(0)
+    for one in views.asked(row, ("side",), 8, np.random.default_rng(0)):
+        left, top, right, bottom = one.thing["bbox"]
+        grid = Question.of(views, row, one).cells.reshape(row.segmentation.shape[0] // CELL, -1)
+        rows, columns = np.nonzero(grid)
+        assert grid.sum() == pytest.approx(1.0)
+        assert top // CELL <= rows.min() <= rows.max() <= (bottom - 1) // CELL
+        assert left // CELL <= columns.min() <= columns.max() <= (right - 1) // CELL
 
 
 def test_the_way_is_printed_place_by_place(tmp_path: Path, model: ProprioMLLM, capsys: pytest.CaptureFixture[str]) -> None:

@@ -43,14 +43,19 @@ def small(sees: bool = False, english: bool = False) -> WordsPlanner:
         text=text,
         vision=vision,
         motion=motion_cfg,
-        cse=dataclasses.replace(cfg.cse, enabled=False),
+        cse=dataclasses.replace(cfg.cse, enabled=sees),
+        point_map=dataclasses.replace(cfg.point_map, width=32, depth=1),
     )
     words = Lessons().words()
     processor = build_processor(cfg, [" ".join(words)] * 2)
     if not english:
         add_word_tokens(processor.tokenizer, words)
     motion = MotionTokenizer(motion_cfg).eval() if sees else None
-    return WordsPlanner(build_model(cfg, processor, 3).eval(), motion)
+    model = build_model(cfg, processor, 3).eval()
+    if model.cse is not None:
+        assert model.cse.named is not None
+        torch.nn.init.constant_(model.cse.named.bias, 5.0)  # every word is looked up
+    return WordsPlanner(model, motion)
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +133,8 @@ def test_what_is_seen_and_felt_tells_in_the_answer(seeing: WordsPlanner, changed
     def scores(observation: Observation) -> torch.Tensor:
         state = begin(seeing)
         turn = turn_example(seeing.model, (), state.look(observation), observation, seeing.motion)
-        return seeing.model.following(Collator(seeing.model.processor, seeing.model.cfg)([turn]), DynamicCache())
+        batch = Collator(seeing.model.processor, seeing.model.cfg)([turn])
+        return seeing.model.following(seeing.model.look(batch), DynamicCache())
 
     assert torch.equal(scores(one), scores(one))
     assert not torch.allclose(scores(one), scores(mixed), atol=1e-6)
@@ -156,7 +162,7 @@ def test_token_after_token_is_read_as_all_at_once(seeing: WordsPlanner) -> None:
     model, collate = seeing.model, Collator(seeing.model.processor, seeing.model.cfg)
     turns = [(begin(seeing), seen(WordsOnly(seed).shown(), seed)) for seed in (3, 4)]  # of different lengths: one is padded
     nows = [state.look(observation) for state, observation in turns]
-    words = [[500, 510, 520], [530, 540, 550]]
+    words = [begin(seeing).words.tokens(said) for said in (("pick", "coffee", "machine"), ("mug", "_2", "do"))]
 
     def examples(count: int) -> list[Example]:
         return [
@@ -164,9 +170,9 @@ def test_token_after_token_is_read_as_all_at_once(seeing: WordsPlanner) -> None:
             for (state, observation), now, answer in zip(turns, nows, words, strict=True)
         ]
 
-    cache, batch = DynamicCache(), collate(examples(0), padding="left")
+    cache, batch = DynamicCache(), model.look(collate(examples(0), padding="left"))
     for count in range(4):
-        whole = model.following(collate(examples(count), padding="left"), DynamicCache())
+        whole = model.following(model.look(collate(examples(count), padding="left")), DynamicCache())
         torch.testing.assert_close(model.following(batch, cache), whole, atol=1e-5, rtol=1e-4)
         if count < 3:
             batch = batch.then(torch.tensor([[answer[count]] for answer in words]))

@@ -70,6 +70,9 @@ def test_tries_of_an_arm_are_drawn_more_often(trained: Pipeline) -> None:
 @pytest.mark.parametrize("stage", ["base", "selu"])
 def test_decisions_beside_a_log_are_learnt_as_alone(trained: Pipeline, stage: str) -> None:
     model = load_model(trained.paths.model(stage), trainable=True).eval()
+    if model.cse is not None:
+        assert model.cse.named is not None
+        torch.nn.init.constant_(model.cse.named.bias, 5.0)  # every word is looked up
     tokens = MotionTokenizer.load(trained.paths.model("tokenizer")) if model.cfg.proprioception else None
     turns = turns_of(trained, model, lessons_of(trained, model.cfg), tokens)
     parts = turns.batch(np.random.default_rng(3), 6)
