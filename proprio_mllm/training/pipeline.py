@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, get_args
 
-from configs.schema.model import ModelConfig
+from configs.schema.model import CseConfig, ModelConfig, MpeConfig
 from configs.schema.train import LoopConfig, TrainConfig, Variant
 from proprio_mllm.model.building import save_model
 from proprio_mllm.model.modeling import ProprioMLLM
@@ -90,7 +90,7 @@ class Stage(Protocol):
 
 
 def variant_model(model: ModelConfig, variant: str) -> ModelConfig:
-    """The model's configuration with the ablated parts switched off.
+    """The model's configuration with the ablated parts switched off, and their options as if they had never been set.
 
     Raises:
         ValueError: on an unknown variant.
@@ -98,8 +98,8 @@ def variant_model(model: ModelConfig, variant: str) -> ModelConfig:
     if variant not in get_args(Variant):
         raise ValueError(f"variant {variant!r}; allowed: {', '.join(get_args(Variant))}")
     none = variant == "no_proprio"
-    mpe = dataclasses.replace(model.mpe, mode="mrope") if none or "mpe" in variant else model.mpe
-    cse = dataclasses.replace(model.cse, enabled=False) if none or "cse" in variant else model.cse
+    mpe = MpeConfig(mode="mrope") if none or "mpe" in variant else model.mpe
+    cse = CseConfig(enabled=False) if none or "cse" in variant else model.cse
     return dataclasses.replace(model, mpe=mpe, cse=cse, proprioception=model.proprioception and not none)
 
 

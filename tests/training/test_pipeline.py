@@ -181,6 +181,8 @@ def test_variants() -> None:
     assert variant_model(model, "no_mpe").mpe.mode == "mrope"
     assert variant_model(model, "no_mpe").cse.enabled
     assert not variant_model(model, "no_mpe_cse").cse.enabled
+    other = dataclasses.replace(model, cse=dataclasses.replace(model.cse, frame="camera"))
+    assert variant_model(other, "no_cse") == variant_model(model, "no_cse") != variant_model(other, "full")
     with pytest.raises(ValueError, match="variant 'half'; allowed: full, no_mpe, no_cse, no_mpe_cse, no_proprio"):
         variant_model(model, "half")
 
