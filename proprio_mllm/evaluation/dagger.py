@@ -104,10 +104,10 @@ def _lessons(config: CollectConfig, part: int, student: str | None = None) -> li
     os.environ.setdefault("MUJOCO_GL", "egl")
     from sim.collection.demonstrations import lessons_of_part
 
-    return list(lessons_of_part(config, part, _Rules(), None if student is None else _in_words(student)))
+    return list(lessons_of_part(config, part, Rules(), None if student is None else _in_words(student)))
 
 
-class _Rules:
+class Rules:
     """The scripted planner as a `Teacher` of `sim.collection.demonstrations`."""
 
     def __init__(self) -> None:

@@ -70,7 +70,7 @@ def test_training_keeps_its_threads(request_: DaggerRequest, monkeypatch: pytest
 def test_lessons_try_what_is_out_of_reach_less_often() -> None:
     config, tries = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, medium_share=0.0, foreseen=True), []
     for index in range(4):
-        episode = run_lesson(config, index, None, dagger._Rules())
+        episode = run_lesson(config, index, None, dagger.Rules())
         tries += [item["feedback"].rpartition(" ")[2] for item in episode.rows[-1]["history"]]
         tries += ["changed" for row in episode.rows if row["target"] != json.loads(row["privileged"])["taught"]]
     assert tries.count("changed") > sum(tries.count(code) for code in ("BodyTooHigh", "BodyTooLow", "TooFar"))

@@ -16,7 +16,7 @@ from data.generator import generate_clip
 from data.retarget import Retargeter
 from interface.bodies import PAPER_ROBOTS
 from interface.steps import PlanStep
-from proprio_mllm.evaluation.dagger import _lessons, _Rules
+from proprio_mllm.evaluation.dagger import Rules, _lessons
 from proprio_mllm.evaluation.lessons import WordsOnly
 from proprio_mllm.evaluation.rollouts import training_tasks
 from robots.spec import load_robot
@@ -54,7 +54,7 @@ def lessons() -> None:
 
 def practice() -> None:
     config = CollectConfig("demos", "unused", COUNT, image_size=16)
-    assert list(lessons_of_part(config, 0, _Rules(), lambda observation: PlanStep.parse("MoveUp(0.05)")))
+    assert list(lessons_of_part(config, 0, Rules(), lambda observation: PlanStep.parse("MoveUp(0.05)")))
 
 
 def self_learning() -> None:
