@@ -24,13 +24,13 @@ from tqdm import tqdm
 
 from configs.arguments import command, read_arguments
 from configs.schema.collect import CollectConfig
-from data.motion import world_to_heading
 from interface.bodies import Arm
 from interface.failures import FailureCode
 from interface.observation import HistoryItem, Observation
 from interface.steps import Action, PlanStep
 from proprio_mllm.evaluation.dagger import Rules
 from sim.collection.demonstrations import run_lesson
+from sim.collection.view_sampling import center_in_pelvis
 from sim.session.session import Session
 
 _REACH: Final = ("", FailureCode.TOO_FAR, FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW)
@@ -87,14 +87,11 @@ class _Watched:
     def _assess(self, observation: Observation, action: Action) -> None:
         playing = (one for one in self._sessions.values() if not one.finished)
         session = next(one for one in playing if one.task.instruction == observation.instruction)
-        refusal, world = session.assess(action), session.world
+        refusal = session.assess(action)
         code = "" if refusal is None else refusal.code
         if code not in _REACH:
             return
-        x, y, z, yaw = world.servos.base_pose[:4]
-        root = np.array([x, y, z, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
-        centre = world_to_heading(world.poses.center(str(action.object_id))[None], root)[0]
-        mirrored = centre * (1.0, -1.0 if action.arm is Arm.RIGHT else 1.0, 1.0)
+        mirrored = center_in_pelvis(session.world, str(action.object_id)) * (1.0, -1.0 if action.arm is Arm.RIGHT else 1.0, 1.0)
         self._found.append(Try(self._lesson, (observation.robot, action.name), mirrored, str(code)))
 
 

@@ -85,7 +85,8 @@ def name_ends(model: ProprioMLLM, batch: Batch, questions: Sequence[Question]) -
 
 def traced(model: ProprioMLLM, questions: Sequence[Question], views: Views) -> dict[str, Tensor]:
     """What stands at each place on the way (K, features), for K questions."""
-    batch = Collator(model.processor, model.cfg)([question.example(views) for question in questions])
+    collate = Collator(model.processor, model.cfg)
+    batch = collate([question.example(views) for question in questions])
     assert batch.images is not None
     layers: Any = model.core.model.language_model.layers
     read: list[Tensor] = []
@@ -100,7 +101,7 @@ def traced(model: ProprioMLLM, questions: Sequence[Question], views: Views) -> d
     for handle in handles:
         handle.remove()
     rows, cells = torch.arange(len(questions)), torch.from_numpy(np.stack([question.cells for question in questions]))
-    seen = batch.input_ids == batch.input_ids.new_tensor(Collator(model.processor, model.cfg).image_token)
+    seen = batch.input_ids == collate.image_token
     found |= {f"visual tokens, layer {number}": hidden[seen].unflatten(0, cells.shape) for number, hidden in enumerate(read)}
     shown = {place: (values.float() * cells[..., None]).sum(1) for place, values in found.items()}
     answers = (batch.labels != IGNORE).int().argmax(1) - 1

@@ -157,7 +157,7 @@ def read_branches(
     position_ids: Tensor,
     layout: Branches,
     kept: Tensor,
-    added: Tensor | None = None,
+    inputs_embeds: Tensor | None = None,
     **inputs: Any,
 ) -> Tensor:
     """Last hidden states of rows with branches.
@@ -168,20 +168,18 @@ def read_branches(
         position_ids: (B, S), or (3, B, S).
         layout: where the branches are.
         kept: (B, S) tokens that are no padding; of each log and each branch, the first ones.
-        added: (B, S, hidden) what is added to the embeddings of the tokens.
+        inputs_embeds: (B, S, hidden) where the embeddings are not those of the tokens alone.
         inputs: what else the model takes.
 
     Returns:
         (B, S, hidden); what it holds of padding means nothing.
     """
     line = _Line.of(layout, kept)
-    ids = input_ids.flatten()[line.slots][None]
-    if added is not None:
-        embedded = model.get_input_embeddings()(ids)
-        inputs["inputs_embeds"] = embedded + line.line(added)[None].to(embedded.dtype)
+    if inputs_embeds is not None:
+        inputs["inputs_embeds"] = line.line(inputs_embeds)[None]
     with _own_attention(getattr(model, "language_model", model)):
         hidden = model(
-            input_ids=ids,
+            input_ids=input_ids.flatten()[line.slots][None],
             attention_mask={"full_attention": line},
             position_ids=position_ids.flatten(-2)[..., line.slots].unsqueeze(-2),
             use_cache=False,

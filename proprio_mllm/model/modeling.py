@@ -157,8 +157,9 @@ class ProprioMLLM(nn.Module):
         words = behind & (ids >= first_word(self.processor.tokenizer))
         most = int(words.sum(1).max())
         order = (~words).int().argsort(dim=1, stable=True)[:, :most]  # where the words of each row are
-        rows = self.table.detach()[ids.gather(1, order)] * words.gather(1, order)[..., None]
-        given = self.cse.named(rows, sight.visual[sight.last], sight.spatial[sight.last]) * words.gather(1, order)[..., None]
+        kept = words.gather(1, order)[..., None]
+        rows = self.table.detach()[ids.gather(1, order)] * kept
+        given = self.cse.named(rows, sight.visual[sight.last], sight.spatial[sight.last]) * kept
         place = order[..., None].expand(-1, -1, rows.shape[2])
         return given.new_zeros(*ids.shape, rows.shape[2]).scatter(1, place, given)[:, sight.before.shape[1] :]
 
@@ -186,13 +187,15 @@ class ProprioMLLM(nn.Module):
             per_image: Any = tuple(batch.sight.tokens)  # one entry per image, as Qwen2.5-VL returns it
             inputs["mm_encoder_outputs"] = {"image": BaseModelOutputWithPooling(pooler_output=per_image)}
         given = self.named(batch)
-        if given is not None and batch.logs is None:
-            embeddings: Any = self.core.get_input_embeddings()
-            embedded = embeddings(batch.input_ids)
+        if given is not None:
+            embedded = self._embedded(batch.input_ids)
             inputs["inputs_embeds"] = embedded + given.to(embedded.dtype)
-        elif given is not None:
-            inputs["added"] = given
         return inputs
+
+    def _embedded(self, ids: Tensor) -> Tensor:
+        """Embeddings of tokens, those of the adapter's rows among them."""
+        embeddings: Any = self.core.get_input_embeddings()
+        return embeddings(ids)
 
     def forward(self, batch: Batch, return_logits: bool = False) -> ModelOutput:
         """Loss of a batch; of a part of one, what it adds to the whole batch's.
@@ -226,10 +229,10 @@ class ProprioMLLM(nn.Module):
         def joined(before: Tensor, rows: Tensor) -> Tensor:  # (E, M) and (E * N, S) to (E, M + N * S)
             return torch.cat([before, rows.unflatten(-2, (logs, turns)).flatten(-2)], -1)
 
-        more = {name: inputs[name] for name in ("mm_encoder_outputs", "added") if name in inputs}
-        if "added" in more:
-            rows = more["added"].unflatten(0, (logs, turns)).flatten(1, 2)  # (E, N * S, D)
-            more["added"] = functional.pad(rows, (0, 0, size, 0))
+        more = {name: inputs[name] for name in ("mm_encoder_outputs", "inputs_embeds") if name in inputs}
+        if "inputs_embeds" in more:
+            rows = more["inputs_embeds"].unflatten(0, (logs, turns)).flatten(1, 2)  # (E, N * S, D)
+            more["inputs_embeds"] = torch.cat([self._embedded(batch.logs.ids), rows], 1)
         hidden = read_branches(
             self.core.model,
             joined(batch.logs.ids, batch.input_ids),

@@ -185,16 +185,20 @@ def camera_in_pelvis(world: World, view: View) -> Array:
     return np.linalg.inv(pelvis) @ view.camera_in_world
 
 
+def center_in_pelvis(world: World, object_id: str) -> Array:
+    """(3,) centre of an object in the pelvis heading frame, metres."""
+    x, y, z, yaw = world.servos.base_pose[:4]
+    root = np.array([x, y, z, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+    return world_to_heading(world.poses.center(object_id)[None], root)[0]
+
+
 def visible_json(world: World, segmentation: NDArray[np.int32]) -> str:
     """What a view shows: id, type, centre in the pelvis heading frame (m), pixels and bounding box (x0, y0, x1, y1)."""
-    root = np.array(
-        [*world.servos.base_pose[:3], np.cos(world.servos.base_pose[3] / 2), 0.0, 0.0, np.sin(world.servos.base_pose[3] / 2)]
-    )
     ids = list(world.objects)
     found: list[dict[str, Any]] = []
     for index in np.unique(segmentation[segmentation >= 0]):
         rows, columns = np.nonzero(segmentation == index)
-        center = world_to_heading(world.poses.center(ids[index])[None], root)[0]
+        center = center_in_pelvis(world, ids[index])
         found.append({
             "id": ids[index],
             "type": world.objects[ids[index]].type.name,
