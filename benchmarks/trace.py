@@ -97,7 +97,7 @@ def traced(model: ProprioMLLM, questions: Sequence[Question], views: Views) -> d
     handles = [layer.register_forward_pre_hook(keep, with_kwargs=True) for layer in layers]
     with torch.no_grad():
         model(batch)
-        found = {"points": model.spatial(batch.images)} if model.cse is not None else {}
+        found = {"points": model.spatial(batch.images)[0]} if model.cse is not None else {}
     for handle in handles:
         handle.remove()
     rows, cells = torch.arange(len(questions)), torch.from_numpy(np.stack([question.cells for question in questions]))

@@ -29,6 +29,7 @@ from data.motion import N_FEATURES
 from data.shards import ShardReader
 from interface.bodies import KEY_BODIES
 from interface.observation import Camera
+from proprio_mllm.model.batch import Collator
 from proprio_mllm.model.building import load_model
 from proprio_mllm.model.geometry import centroid, project
 from proprio_mllm.model.mpe import relative_cells
@@ -143,14 +144,15 @@ def told_by_points(options: Options) -> dict[str, dict[str, tuple[int, int]]]:
     """Held-out answers that the mean point of an object's token gets right, of how many, by source and question."""
     model = load_model(options.model)
     assert model.point_map is not None, f"{options.model} has no point map"
-    views = Views(Path(options.views), model.cfg)
+    views, collate = Views(Path(options.views), model.cfg), Collator(model.processor, model.cfg)
     counts = {source: defaultdict[str, list[bool]](list) for source in ("true points", "the point map's points")}
     for index in views.split.test[views.split.test < options.rows]:
         row = views.row(int(index))
         bodies, camera = row.view.key_bodies, row.view.camera
         assert bodies is not None and camera is not None
         pose = np.asarray(camera.camera_in_pelvis, dtype=np.float64)
-        own = model.point_map(torch.tensor(row.view.image).permute(2, 0, 1)[None]).points_m[0].numpy()
+        images = collate.images([row.view])
+        own = model.point_map(images.rgb, None, images.stance).points_m[0].numpy()
         for centre, i, j in cells_of(row.objects, camera, options.grid):
             truth = answers_about(centre, bodies)
             for source, points in zip(counts, (row.points_m, own), strict=True):

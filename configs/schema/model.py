@@ -58,9 +58,10 @@ class PointMapConfig:
     """Point-map encoder that gives F3D.
 
     Attributes:
-        encoder: `sim` is our small encoder, `cut3r` the user's checkout and weights, `oracle` the true depth, `none` nothing.
-        width: channels of `sim`'s tokens.
-        depth: transformer blocks of `sim`.
+        encoder: `sim` is our small encoder, `named` one that also knows what is where, `cut3r` the user's checkout and weights,
+            `oracle` the true depth, `none` nothing.
+        width: channels of the attention of `sim` and `named`.
+        depth: its blocks.
         checkout: CUT3R's source folder.
         checkpoint: CUT3R's weights.
         sha256: the checksum the user expects of `checkpoint`.
@@ -68,7 +69,7 @@ class PointMapConfig:
         size: side of the image that CUT3R sees, pixels.
     """
 
-    encoder: Literal["sim", "cut3r", "oracle", "none"] = "sim"
+    encoder: Literal["sim", "named", "cut3r", "oracle", "none"] = "sim"
     width: int = 96
     depth: int = 2
     checkout: str | None = None
@@ -234,7 +235,7 @@ class ModelConfig:
         require(self.image_size > 0 and self.image_size % 28 == 0, f"image_size {self.image_size} must be a multiple of 28")
         require(
             not (self.cse.enabled and self.point_map.encoder == "none"),
-            "cse.enabled needs a point map: point_map.encoder 'none' is not allowed; allowed: sim, cut3r, oracle",
+            "cse.enabled needs a point map: point_map.encoder 'none' is not allowed; allowed: sim, named, cut3r, oracle",
         )
         require(
             not (self.cse.enabled and self.point_map.encoder == "oracle" and self.cse.source != "points"),

@@ -302,6 +302,10 @@ class TrainConfig:
             self.practice.student is None or self.model.weights is not None,
             f"practice.student {self.practice.student!r}: the model of stage words acts, unless model.weights are given",
         )
+        require(
+            self.model.weights is None or self.model.point_map.encoder != "named",
+            "point_map.encoder 'named' learns the words of stage practice, which model.weights leave out; allowed: sim, cut3r",
+        )
         require(not self.shard or self.model.weights is not None, "shard=true shares a frozen backbone; set model.weights")
         require(not (self.shard and self.model.four_bit), "shard=true cannot share layers of 4 bits: leave out one of the two")
         require(self.micro_batches >= 1, f"micro_batches {self.micro_batches} must be at least 1")

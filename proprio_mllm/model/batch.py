@@ -26,7 +26,7 @@ from torch.nn import functional
 from configs.schema.model import ModelConfig
 from interface.observation import Camera
 from proprio_mllm.model.chat import Encoded, Message, encode
-from proprio_mllm.model.geometry import centroid
+from proprio_mllm.model.geometry import above_floor_m, centroid
 from proprio_mllm.model.mpe import Centroid, position_ids
 from proprio_mllm.model.processor import ProprioProcessor
 from proprio_mllm.model.vocabulary import MOTION_END, MOTION_START
@@ -101,6 +101,7 @@ class ImageBatch(Movable):
         grid: (h, w) of the merged tokens, the same for every image.
         centroids: the robot's place in each image as fractions, or None.
         camera_in_pelvis: (I, 4, 4), or None when some image has no camera.
+        above_floor_m: (I,) heights of the cameras above the lowest key body, or None when some image has no camera or no robot.
         points_m: (I, H, W, 3) true points, or None when some image has none.
     """
 
@@ -110,7 +111,15 @@ class ImageBatch(Movable):
     grid: tuple[int, int]
     centroids: tuple[Centroid | None, ...]
     camera_in_pelvis: Tensor | None = None
+    above_floor_m: Tensor | None = None
     points_m: Tensor | None = None
+
+    @property
+    def stance(self) -> Tensor | None:
+        """How the cameras stand (I, 4): which way is up in the camera frame, and the height above the floor, metres."""
+        if self.camera_in_pelvis is None or self.above_floor_m is None:
+            return None
+        return torch.cat([self.camera_in_pelvis[:, 2, :3], self.above_floor_m[:, None]], dim=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,20 +138,39 @@ class Logs(Movable):
 
 
 @dataclass(frozen=True, slots=True)
+class Places(Movable):
+    """What words look up in pictures (`proprio_mllm.model.cse.NamedPoints`), in N cells.
+
+    Attributes:
+        keys: (I, N, D), like the rows of the names of what a cell shows.
+        values: (I, N, F) of its place.
+        trust: (I, N) logarithms of how much each counts.
+    """
+
+    keys: Tensor
+    values: Tensor
+    trust: Tensor
+
+    def of(self, images: Tensor) -> Places:
+        """Those of some images (B,)."""
+        return Places(self.keys[images], self.values[images], self.trust[images])
+
+
+@dataclass(frozen=True, slots=True)
 class Sight(Movable):
     """What a model has made of the pictures of a batch (`ProprioMLLM.look`); rows that go on still have it.
 
     Attributes:
         visual: (I, N, D) F2D.
         tokens: (I, N, D) what the language model reads.
-        spatial: (I, N, F) F3D where words look it up, or None.
+        places: what words look up, or None where they do not.
         last: (B,) the last picture of each row, -1 where there is none.
         before: (B, K) the last tokens before the rows.
     """
 
     visual: Tensor
     tokens: Tensor
-    spatial: Tensor | None
+    places: Places | None
     last: Tensor
     before: Tensor
 
@@ -221,6 +249,11 @@ class Collator:
         h, w = (int(n) // self._merge for n in grid_thw[0, 1:])
         rgb = torch.from_numpy(np.stack([view.image for view in views])).permute(0, 3, 1, 2)
         cameras = [view.camera.camera_in_pelvis for view in views if view.camera is not None]
+        heights = [
+            above_floor_m(view.camera, view.key_bodies)
+            for view in views
+            if view.camera is not None and view.key_bodies is not None
+        ]
         points = [view.points_m for view in views if view.points_m is not None]
         return ImageBatch(
             pixel_values=features["pixel_values"],
@@ -229,6 +262,7 @@ class Collator:
             grid=(h, w),
             centroids=tuple(self._centroid(view) for view in views),
             camera_in_pelvis=torch.from_numpy(np.stack(cameras)).float() if len(cameras) == len(views) else None,
+            above_floor_m=torch.tensor(heights) if len(heights) == len(views) else None,
             points_m=torch.from_numpy(np.stack(points)).float() if len(points) == len(views) else None,
         )
 

@@ -23,7 +23,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from peft import LoraConfig as PeftLoraConfig
@@ -38,6 +38,7 @@ from proprio_mllm.model.backbone import PatchEmbedding, backbone_config
 from proprio_mllm.model.groups import adapter_of
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.model.named_map import NamedPointMap
 from proprio_mllm.model.point_map import OraclePointMap, SimPointMap
 from proprio_mllm.model.processor import ProprioProcessor, load_processor, make_processor
 from proprio_mllm.model.tensors import check_files, file_hashes, read_tensors, write_tensors
@@ -70,11 +71,17 @@ def build_processor(cfg: ModelConfig, texts: Sequence[str] = (), whole_words: Se
     return processor
 
 
+#: Point-map encoders that stage `pointmap` trains.
+TRAINED_HERE: Final = ("sim", "named")
+
+
 def build_point_map(cfg: ModelConfig) -> nn.Module | None:
     """The configured point-map encoder, untrained; None for `none`."""
     point_map = cfg.point_map
     if point_map.encoder == "sim":
         return SimPointMap(point_map.width, point_map.depth)
+    if point_map.encoder == "named":
+        return NamedPointMap(point_map.width, point_map.depth, cfg.text.hidden, cfg.image_size)
     if point_map.encoder == "oracle":
         return OraclePointMap()
     if point_map.encoder == "cut3r":

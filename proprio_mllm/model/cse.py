@@ -7,8 +7,9 @@ MLP's last layer starts at zero (off and on are equal at the start); `literal` g
 
 What CSE adds to a visual token is of use only to a language model that finds the token by the name of a thing. The released
 Qwen2.5-VL does; a small one that is trained from nothing did not learn to (docs/model.md). So beyond the paper, F3D can be
-looked up by name (`NamedPoints`): a word behind a picture gets F3D of the cells that look like it, since dense pretraining ties
-visual tokens to names (`proprio_mllm.model.dense`).
+looked up by name (`NamedPoints`): a word behind a picture gets F3D of the cells that look like it. Which do is told by the
+point map where it knows what is where (`proprio_mllm.model.named_map`), else by F2D, which dense pretraining ties to names
+(`proprio_mllm.model.dense`).
 
 Shape letters: I images, h and w rows and columns of the merged grid, N = h * w, D hidden size, C token channels, B rows of W
 words.
@@ -21,6 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from configs.schema.model import CseConfig
+from proprio_mllm.model.batch import Places
 from proprio_mllm.model.point_map import GeoFeatures
 
 #: Points beyond this are held to it, metres.
@@ -36,9 +38,10 @@ class CrossSpatialEncoder(nn.Module):
         cfg: switches.
         hidden: D.
         token_dim: C of the point-map encoder, 0 when it has no tokens.
+        names: whether it knows what is where.
     """
 
-    def __init__(self, cfg: CseConfig, hidden: int, token_dim: int) -> None:
+    def __init__(self, cfg: CseConfig, hidden: int, token_dim: int, names: bool = False) -> None:
         super().__init__()
         if cfg.source in ("tokens", "both") and token_dim == 0:
             raise ValueError(f"cse.source {cfg.source!r} needs a point-map encoder with tokens; allowed without: points")
@@ -52,7 +55,9 @@ class CrossSpatialEncoder(nn.Module):
             assert isinstance(last, nn.Linear)
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
-        self.named = NamedPoints(inputs, hidden) if cfg.named else None
+        #: Whether words look into the point map itself.
+        self.names = names and cfg.named
+        self.named = NamedPoints(token_dim + 8 if names else inputs, hidden) if cfg.named else None
 
     def spatial(self, geo: GeoFeatures, h: int, w: int, camera_in_pelvis: Tensor | None) -> Tensor:
         """F3D on the merged grid, (I, N, inputs of Phi).
@@ -72,14 +77,8 @@ class CrossSpatialEncoder(nn.Module):
             tokens = functional.interpolate(geo.tokens.float(), size=(h, w), mode="bilinear", antialias=True)  # (I, C, h, w)
             parts.append(tokens.flatten(2).transpose(1, 2))
         if self.cfg.source != "tokens":
-            points = geo.points_m.float()
-            if self.cfg.frame == "pelvis":
-                if camera_in_pelvis is None:
-                    raise ValueError("cse.frame 'pelvis' needs a camera pose for every image")
-                pose = camera_in_pelvis.to(points)
-                points = torch.einsum("iab,ihwb->ihwa", pose[:, :3, :3], points) + pose[:, None, None, :3, 3]
-            valid = (geo.conf > 0).to(points)
-            planes = torch.cat([points.clamp(-FAR_M, FAR_M) / 2.0, geo.conf.clamp_min(1.0).log()[..., None]], dim=-1)
+            valid = (geo.conf > 0).to(geo.conf)
+            planes = self._planes(geo.points_m, geo.conf, camera_in_pelvis)
             planes = (planes * valid[..., None]).permute(0, 3, 1, 2)  # (I, 4, H, W)
             pooled = functional.adaptive_avg_pool2d(planes, (2 * h, 2 * w))
             share = functional.adaptive_avg_pool2d(valid[:, None], (2 * h, 2 * w))
@@ -87,6 +86,39 @@ class CrossSpatialEncoder(nn.Module):
             cells = pooled.unflatten(2, (h, 2)).unflatten(4, (w, 2))  # (I, 4, h, 2, w, 2)
             parts.append(cells.permute(0, 2, 4, 1, 3, 5).reshape(len(cells), h * w, 16))
         return torch.cat(parts, dim=-1)
+
+    def _planes(self, points_m: Tensor, conf: Tensor, camera_in_pelvis: Tensor | None) -> Tensor:
+        """Points in the configured frame and logarithms of their confidence, (I, H, W, 4), of size 1."""
+        points = points_m.float()
+        if self.cfg.frame == "pelvis":
+            if camera_in_pelvis is None:
+                raise ValueError("cse.frame 'pelvis' needs a camera pose for every image")
+            pose = camera_in_pelvis.to(points)
+            points = torch.einsum("iab,ihwb->ihwa", pose[:, :3, :3], points) + pose[:, None, None, :3, 3]
+        return torch.cat([points.clamp(-FAR_M, FAR_M) / 2.0, conf.clamp_min(1.0).log()[..., None]], dim=-1)
+
+    def places(
+        self, visual: Tensor, spatial: Tensor, geo: GeoFeatures | None, camera_in_pelvis: Tensor | None
+    ) -> Places | None:
+        """What words look up, or None where they do not: cells of the point map where it knows what they show, else F2D's.
+
+        Args:
+            visual: (I, N, D) F2D.
+            spatial: (I, N, inputs of Phi).
+            geo: the encoder's output; may be missing where it knows no names.
+            camera_in_pelvis: (I, 4, 4).
+        """
+        if self.named is None:
+            return None
+        if not self.names:
+            return Places(visual, spatial, spatial.new_zeros(spatial.shape[:2]))
+        assert geo is not None and geo.named is not None and geo.tokens is not None
+        values = [
+            self._planes(geo.named.centres_m, geo.named.conf, camera_in_pelvis),
+            self._planes(geo.points_m, geo.conf, camera_in_pelvis),
+            geo.tokens.float().permute(0, 2, 3, 1),
+        ]
+        return Places(geo.named.keys.flatten(1, 2), torch.cat(values, -1).flatten(1, 2), geo.named.conf.log().flatten(1, 2))
 
     def forward(self, features: Tensor, spatial: Tensor) -> Tensor:
         """T (I, N, D) from F2D (I, N, D) and what `spatial` gives."""
@@ -98,11 +130,11 @@ class CrossSpatialEncoder(nn.Module):
 class NamedPoints(nn.Module):
     """What words get of a picture that shows what they name.
 
-    A word's cosine with F2D, by itself or together with up to `NAME_WORDS - 1` words before it, whichever is larger, tells
-    which cells show it: F3D is their mean, and passes an MLP and a gate that opens where the cosine is large.
+    A word's cosine with the keys of cells, by itself or together with up to `NAME_WORDS - 1` words before it, whichever is
+    larger, tells which cells show it: their values' mean passes an MLP and a gate that opens where the cosine is large.
 
     Args:
-        inputs: channels of F3D.
+        inputs: F, channels of values.
         hidden: D.
     """
 
@@ -113,13 +145,12 @@ class NamedPoints(nn.Module):
         self.bias = nn.Parameter(torch.tensor(-5.0))
         self.put = nn.Sequential(nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, hidden))
 
-    def forward(self, words: Tensor, visual: Tensor, spatial: Tensor) -> Tensor:
+    def forward(self, words: Tensor, places: Places) -> Tensor:
         """What is added to the embeddings of words (B, W, D).
 
         Args:
             words: (B, W, D) rows of the language model's table, one word after the other.
-            visual: (B, N, D) F2D of the picture that each row sees.
-            spatial: (B, N, inputs) F3D.
+            places: (B, N, ...) of the picture that each row sees.
         """
         own = self.scale.dtype
         rows = words.to(own)
@@ -127,8 +158,9 @@ class NamedPoints(nn.Module):
         for count in range(1, min(NAME_WORDS, rows.shape[1])):
             spans.append(spans[-1] + functional.pad(rows[:, :-count], (0, 0, count, 0)))
         unit = functional.normalize(torch.stack(spans), dim=-1)  # (spans, B, W, D)
-        cosine = unit @ functional.normalize(visual.to(own), dim=-1).mT  # (spans, B, W, N)
+        cosine = unit @ functional.normalize(places.keys.to(own), dim=-1).mT  # (spans, B, W, N)
         best = cosine.amax(-1).argmax(0)  # (B, W)
         scores = cosine.gather(0, best[None, ..., None].expand(1, *cosine.shape[1:]))[0].float() * self.scale.exp()
         gate = (scores.amax(-1, keepdim=True) + self.bias).sigmoid()
-        return gate * self.put(scores.softmax(-1).to(own) @ spatial.to(own))
+        shares = (scores + places.trust[:, None]).softmax(-1).to(own)
+        return gate * self.put(shares @ places.values.to(own))

@@ -183,9 +183,9 @@ class Cut3rPointMap(nn.Module):
         return super().train(False)
 
     @torch.no_grad()
-    def forward(self, rgb: Tensor, points_m: Tensor | None = None) -> GeoFeatures:
+    def forward(self, rgb: Tensor, points_m: Tensor | None = None, stance: Tensor | None = None) -> GeoFeatures:
         """Decoder tokens, points and confidence of images (I, 3, rows, columns) in [0, 255]."""
-        del points_m
+        del points_m, stance
         images = functional.interpolate(rgb.float(), size=(self.size, self.size), mode="bilinear", antialias=True)
         images = images / 127.5 - 1.0
         count, device = len(images), images.device

@@ -77,6 +77,11 @@ def centroid(camera: Camera, key_bodies: NDArray[np.floating], provider: Centroi
     return x / camera.width, y / camera.height
 
 
+def above_floor_m(camera: Camera, key_bodies: NDArray[np.floating]) -> float:
+    """Height of the camera above the robot's lowest key body, which stands on the floor, metres."""
+    return float(camera.camera_in_pelvis[2, 3] - _check(key_bodies)[:, 2].min())
+
+
 def unproject(depth_m: NDArray[np.floating], intrinsics: NDArray[np.floating]) -> NDArray[np.float32]:
     """Points (H, W, 3) in the camera frame from depth (H, W) along the camera's axis and K (3, 3), pixel centres at +0.5.
 

@@ -26,6 +26,8 @@ from proprio_mllm.model.batch import IGNORE, Batch, ImageBatch, Sight
 from proprio_mllm.model.branches import Branches, read_branches
 from proprio_mllm.model.cse import CrossSpatialEncoder
 from proprio_mllm.model.mpe import SignEmbedding
+from proprio_mllm.model.named_map import NamedPointMap
+from proprio_mllm.model.point_map import GeoFeatures
 from proprio_mllm.model.processor import ProprioProcessor
 from proprio_mllm.model.spatial_cache import SpatialCache
 from proprio_mllm.model.word_tokens import first_word
@@ -86,7 +88,7 @@ class ProprioMLLM(nn.Module):
             if point_map is None:
                 raise ValueError("cse.enabled needs a point map, got None")
             encoder: Any = point_map
-            self.cse = CrossSpatialEncoder(cfg.cse, hidden, int(encoder.token_dim))
+            self.cse = CrossSpatialEncoder(cfg.cse, hidden, int(encoder.token_dim), isinstance(encoder, NamedPointMap))
             point_map.requires_grad_(False)
         self.mpe = SignEmbedding(hidden) if cfg.mpe.mode in ("embed_sign", "rope_sign+embed") else None
         tokenizer = processor.tokenizer
@@ -134,21 +136,21 @@ class ProprioMLLM(nn.Module):
             return batch
         images, (h, w) = batch.images, batch.images.grid
         visual = tokens = self.visual_tokens(images)
-        spatial = None if self.cse is None else self.spatial(images)
+        places = None
         if self.cse is not None:
-            assert spatial is not None
+            spatial, geo = self.spatial(images)
             tokens = self.cse(tokens, spatial)
+            places = self.cse.places(visual, spatial, geo, images.camera_in_pelvis)
         if self.mpe is not None:
             tokens = tokens + torch.stack([self.mpe(h, w, place) for place in images.centroids]).to(tokens.dtype)
         count = (batch.input_ids == self._image).sum(1) // visual.shape[1]
         last = (count.cumsum(0) - 1).masked_fill(count == 0, -1)
-        looks_up = self.cse is not None and self.cse.named is not None
-        return replace(batch, sight=Sight(visual, tokens, spatial if looks_up else None, last, batch.input_ids[:, :0]))
+        return replace(batch, sight=Sight(visual, tokens, places, last, batch.input_ids[:, :0]))
 
     def named(self, batch: Batch) -> Tensor | None:
         """What the words of a batch get of the last picture before them (B, S, D), or None where nothing is looked up."""
         sight = batch.sight
-        if sight is None or sight.spatial is None:
+        if sight is None or sight.places is None:
             return None
         assert self.cse is not None and self.cse.named is not None
         ids = torch.cat([sight.before, batch.input_ids], dim=1)
@@ -159,22 +161,23 @@ class ProprioMLLM(nn.Module):
         order = (~words).int().argsort(dim=1, stable=True)[:, :most]  # where the words of each row are
         kept = words.gather(1, order)[..., None]
         rows = self.table.detach()[ids.gather(1, order)] * kept
-        given = self.cse.named(rows, sight.visual[sight.last], sight.spatial[sight.last]) * kept
+        given = self.cse.named(rows, sight.places.of(sight.last)) * kept
         place = order[..., None].expand(-1, -1, rows.shape[2])
         return given.new_zeros(*ids.shape, rows.shape[2]).scatter(1, place, given)[:, sight.before.shape[1] :]
 
     def keep_spatial(self) -> None:
-        """From now on, what the point map makes of an image is kept (`spatial_cache`)."""
-        if self.cse is not None and self.point_map is not None:
+        """From now on, what the point map makes of an image is kept (`spatial_cache`); not of one that words look into."""
+        if self.cse is not None and self.point_map is not None and not self.cse.names:
             self.seen = SpatialCache(self.point_map, self.cse)
 
     @torch.no_grad()
-    def spatial(self, images: ImageBatch) -> Tensor:
-        """F3D on the merged grid (`CrossSpatialEncoder.spatial`), read from `self.seen` where that is."""
+    def spatial(self, images: ImageBatch) -> tuple[Tensor, GeoFeatures | None]:
+        """F3D on the merged grid (`CrossSpatialEncoder.spatial`) and what it is made of; F3D alone where `self.seen` is."""
         assert self.cse is not None and self.point_map is not None
-        if self.seen is None:
-            return self.cse.spatial(self.point_map(images.rgb, images.points_m), *images.grid, images.camera_in_pelvis)
-        return self.seen.spatial(self.cse, self.point_map, images)
+        if self.seen is not None:
+            return self.seen.spatial(self.cse, self.point_map, images), None
+        geo = self.point_map(images.rgb, images.points_m, images.stance)
+        return self.cse.spatial(geo, *images.grid, images.camera_in_pelvis), geo
 
     def _inputs(self, batch: Batch) -> dict[str, Any]:
         inputs: dict[str, Any] = {

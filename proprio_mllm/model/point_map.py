@@ -1,7 +1,8 @@
 """Point-map encoders: from an RGB image to 3-D features (paper: CSE, "point-map based features" F3D).
 
-`SimPointMap` is a small network trained on the simulator's depth, the embedded default; it does not claim to equal CUT3R, whose
-adapter is in `proprio_mllm.model.cut3r`. `OraclePointMap` hands through true points, an upper bound.
+`SimPointMap` is a small network trained on the simulator's depth; it does not claim to equal CUT3R, whose adapter is in
+`proprio_mllm.model.cut3r`. `NamedPointMap` (`proprio_mllm.model.named_map`) also knows what is where. `OraclePointMap` hands
+through true points, an upper bound. All are called with the image, true points or None, and how the camera stands or None.
 
 All points are in the camera frame (x right, y down, z forward), metres. Shape letters: I images, H and W image rows and
 columns, h and w rows and columns of the tokens, C token channels.
@@ -9,12 +10,33 @@ columns, h and w rows and columns of the tokens, C token channels.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+#: Reward of confidence in `confident_loss`.
+CONFIDENCE: Final = 0.2
+#: Largest distance that is learnt, metres.
+FAR_M: Final = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """What is where.
+
+    Attributes:
+        keys: (I, h, w, D) unit vectors, like the rows of the names of what each cell shows.
+        centres_m: (I, h, w, 3) camera frame, of the thing that each cell shows.
+        conf: (I, h, w), at least 1.
+    """
+
+    keys: Tensor
+    centres_m: Tensor
+    conf: Tensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,17 +47,28 @@ class GeoFeatures:
         tokens: (I, C, h, w), or None for encoders without tokens.
         points_m: (I, H, W, 3) camera frame; rows and columns may be coarser than the image's.
         conf: (I, H, W), at least 1; 0 marks pixels without a point.
+        named: what is where, or None for encoders that do not know.
     """
 
     tokens: Tensor | None
     points_m: Tensor
     conf: Tensor
+    named: Named | None = None
 
 
-def _pixels(rgb: Tensor) -> Tensor:
+def pixels(rgb: Tensor) -> Tensor:
     if rgb.ndim != 4 or rgb.shape[1] != 3:
         raise ValueError(f"rgb: expected (images, 3, rows, columns), got {tuple(rgb.shape)}")
     return rgb.float() / 127.5 - 1.0
+
+
+def points_and_confidence(raw: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (..., 3), metres, and their confidence (...), from what a head gives (..., 4).
+
+    Direction times exp(norm) - 1, as CUT3R's head: the error grows with distance, as depth errors do.
+    """
+    norm = (raw[..., :3].square().sum(-1, keepdim=True) + 1e-12).sqrt()
+    return raw[..., :3] / norm * torch.expm1(norm.clamp(max=5.0)), 1.0 + raw[..., 3].clamp(max=8.0).exp()
 
 
 def _convolution(inputs: int, outputs: int, stride: int) -> nn.Sequential:
@@ -71,10 +104,10 @@ class SimPointMap(nn.Module):
             bias: Any = self.head.bias
             bias[2] = 1.0  # start 1.7 m ahead
 
-    def forward(self, rgb: Tensor, points_m: Tensor | None = None) -> GeoFeatures:
+    def forward(self, rgb: Tensor, points_m: Tensor | None = None, stance: Tensor | None = None) -> GeoFeatures:
         """Tokens, points and confidence of images (I, 3, H, W)."""
-        del points_m
-        x = _pixels(rgb)
+        del points_m, stance
+        x = pixels(rgb)
         rows = torch.linspace(-1, 1, x.shape[2], device=x.device).view(1, 1, -1, 1).expand(len(x), 1, -1, x.shape[3])
         cols = torch.linspace(-1, 1, x.shape[3], device=x.device).view(1, 1, 1, -1).expand(len(x), 1, x.shape[2], -1)
         quarter = self.quarter(self.stem(torch.cat([x, rows, cols], dim=1)))  # (I, 48, H/4, W/4)
@@ -85,10 +118,7 @@ class SimPointMap(nn.Module):
         grid = tokens.transpose(1, 2).reshape(grid.shape)
         up = functional.interpolate(grid, size=quarter.shape[2:], mode="bilinear")
         raw = self.head(self.fuse(torch.cat([up, quarter], dim=1))).permute(0, 2, 3, 1)  # (I, H/4, W/4, 4)
-        # Direction times exp(norm) - 1, as CUT3R's head: the error grows with distance, as depth errors do.
-        norm = (raw[..., :3].square().sum(-1, keepdim=True) + 1e-12).sqrt()
-        points = raw[..., :3] / norm * torch.expm1(norm.clamp(max=5.0))
-        return GeoFeatures(grid, points, 1.0 + raw[..., 3].clamp(max=8.0).exp())
+        return GeoFeatures(grid, *points_and_confidence(raw))
 
 
 class OraclePointMap(nn.Module):
@@ -96,38 +126,42 @@ class OraclePointMap(nn.Module):
 
     token_dim = 0
 
-    def forward(self, rgb: Tensor, points_m: Tensor | None = None) -> GeoFeatures:
+    def forward(self, rgb: Tensor, points_m: Tensor | None = None, stance: Tensor | None = None) -> GeoFeatures:
         """Confidence 1 wherever the true point is finite.
 
         Raises:
             ValueError: without true points.
         """
+        del stance
         if points_m is None:
             raise ValueError("point_map.encoder 'oracle' needs true points, but the batch has none")
         valid = torch.isfinite(points_m).all(dim=-1)
         return GeoFeatures(None, torch.where(valid[..., None], points_m, 0.0), valid.to(points_m.dtype))
 
 
-def _centres(fine: int, coarse: int) -> Tensor:
-    """Index of the fine pixel at the centre of each coarse one."""
-    return ((torch.arange(coarse) + 0.5) * (fine / coarse)).long()
+def read_at_centres(values: Tensor, shape: Sequence[int]) -> Tensor:
+    """Of (I, H, W, ...) those at the centres of the pixels of a coarser picture (I, h, w, ...)."""
+    rows, cols = (((torch.arange(shape[axis]) + 0.5) * (values.shape[axis] / shape[axis])).long() for axis in (1, 2))
+    return values[:, rows][:, :, cols]
 
 
-def point_map_loss(geo: GeoFeatures, points_m: Tensor, weight: float = 0.2, far_m: float = 20.0) -> Tensor:
-    """CUT3R's confidence-weighted loss, mean of conf * |p - p_true| - weight * log(conf), in metres.
+def confident_loss(points_m: Tensor, conf: Tensor, truth_m: Tensor, weights: Tensor | None = None) -> Tensor:
+    """CUT3R's confidence-weighted loss, mean of conf * |p - p_true| - `CONFIDENCE` * log(conf), in metres.
 
     Args:
-        geo: prediction.
-        points_m: (I, H, W, 3) true points, camera frame, read at the centres of the prediction's pixels; those that are not
-            finite or farther than `far_m` are left out.
-        weight: reward of confidence.
-        far_m: largest distance that is learnt.
+        points_m: (..., 3) prediction.
+        conf: (...) its confidence.
+        truth_m: (..., 3); points that are not finite or farther than `FAR_M` are left out.
+        weights: (...) of the mean, by default all alike.
     """
-    rows, cols = (_centres(points_m.shape[axis], geo.points_m.shape[axis]) for axis in (1, 2))
-    truth = points_m[:, rows][:, :, cols].to(geo.points_m)
-    valid = torch.isfinite(truth).all(dim=-1)
-    truth = torch.where(valid[..., None], truth, 0.0)
-    valid &= truth.square().sum(-1) < far_m**2
-    error = ((geo.points_m - truth).square().sum(-1) + 1e-12).sqrt()
-    loss = geo.conf * error - weight * geo.conf.log()
-    return (loss * valid).sum() / valid.sum().clamp_min(1)
+    valid = torch.isfinite(truth_m).all(dim=-1)
+    truth = torch.where(valid[..., None], truth_m, 0.0).to(points_m)
+    kept = (valid & (truth.square().sum(-1) < FAR_M**2)).to(conf)
+    kept = kept if weights is None else kept * weights
+    error = ((points_m - truth).square().sum(-1) + 1e-12).sqrt()
+    return ((conf * error - CONFIDENCE * conf.log()) * kept).sum() / kept.sum().clamp_min(1)
+
+
+def point_map_loss(geo: GeoFeatures, points_m: Tensor) -> Tensor:
+    """`confident_loss` of predicted points against true ones (I, H, W, 3), read at the centres of the prediction's pixels."""
+    return confident_loss(geo.points_m, geo.conf, read_at_centres(points_m, geo.points_m.shape).to(geo.points_m))

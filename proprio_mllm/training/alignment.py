@@ -3,7 +3,7 @@
 | phase | pairs | trains | frozen |
 |---|---|---|---|
 | text (2a-i) | motion to text, to body state and back, masked motion, replay | motion rows, LoRA | vision, merger, CSE |
-| image (2a-ii) | motion and image to text, replay | motion rows, LoRA, CSE, MPE | vision, merger |
+| image (2a-ii) | motion and image to text, motion to body state, replay | motion rows, LoRA, CSE, MPE | vision, merger |
 | joint (2b) | all of them | motion rows, LoRA, CSE, MPE, merger | vision, backbone |
 
 "Freeze the image and text weights separately" leaves open which weights; in this reading the vision tower stays as it is while
@@ -56,7 +56,7 @@ class Phase:
 
 PHASES: Final[Mapping[str, Phase]] = {
     "text": Phase(("rows", "lora"), ("say", "feel", "feel", "feel", "do", "fill", "plan")),
-    "image": Phase(("rows", "lora", "cse", "mpe"), ("say_image", "body", "body", "body", "body", "plan")),
+    "image": Phase(("rows", "lora", "cse", "mpe"), ("say_image", "feel", "body", "body", "body", "body", "plan")),
     "joint": Phase(
         ("rows", "lora", "cse", "mpe", "merger"),
         ("say", "feel", "feel", "do", "fill", "say_image", "body", "body", "body", "body", "body", "body", "plan"),

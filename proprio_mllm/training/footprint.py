@@ -25,9 +25,9 @@ from transformers import Qwen2_5_VLForConditionalGeneration
 from configs.schema.model import ModelConfig
 from configs.schema.train import TrainConfig
 from proprio_mllm.model.backbone import backbone_config, given_config
-from proprio_mllm.model.building import LORA_TARGETS, build_processor, quiet_peft
+from proprio_mllm.model.building import LORA_TARGETS, TRAINED_HERE, build_point_map, build_processor, quiet_peft
 from proprio_mllm.model.cse import CrossSpatialEncoder
-from proprio_mllm.model.point_map import SimPointMap
+from proprio_mllm.model.named_map import NamedPointMap
 from proprio_mllm.model.vocabulary import motion_tokens
 from proprio_mllm.training.pipeline import variant_model
 
@@ -182,12 +182,11 @@ def _config(model: ModelConfig, **text: Any) -> Any:  # transformers' type says 
 def _heads(model: ModelConfig, hidden: int) -> dict[str, nn.Module]:
     heads: dict[str, nn.Module] = {}
     if model.cse.enabled:
-        ours = model.point_map.encoder == "sim"
-        heads["cross-spatial encoder"] = CrossSpatialEncoder(
-            model.cse, hidden, model.point_map.width if ours else _CUT3R_TOKENS
-        )
-        if ours:
-            heads["point map"] = SimPointMap(model.point_map.width, model.point_map.depth)
+        ours = build_point_map(model) if model.point_map.encoder in TRAINED_HERE else None
+        channels: Any = _CUT3R_TOKENS if ours is None else ours.token_dim
+        heads["cross-spatial encoder"] = CrossSpatialEncoder(model.cse, hidden, channels, isinstance(ours, NamedPointMap))
+        if ours is not None:
+            heads["point map"] = ours
     return heads
 
 

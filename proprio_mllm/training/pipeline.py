@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, get_args
 
-from configs.schema.model import CseConfig, ModelConfig, MpeConfig
+from configs.schema.model import CseConfig, ModelConfig, MpeConfig, PointMapConfig
 from configs.schema.train import LoopConfig, TrainConfig, Variant
 from proprio_mllm.model.building import save_model
 from proprio_mllm.model.modeling import ProprioMLLM
@@ -99,8 +99,10 @@ def variant_model(model: ModelConfig, variant: str) -> ModelConfig:
         raise ValueError(f"variant {variant!r}; allowed: {', '.join(get_args(Variant))}")
     none = variant == "no_proprio"
     mpe = MpeConfig(mode="mrope") if none or "mpe" in variant else model.mpe
-    cse = CseConfig(enabled=False) if none or "cse" in variant else model.cse
-    return dataclasses.replace(model, mpe=mpe, cse=cse, proprioception=model.proprioception and not none)
+    parts: dict[str, Any] = {"mpe": mpe, "proprioception": model.proprioception and not none}
+    if none or "cse" in variant:
+        parts |= {"cse": CseConfig(enabled=False), "point_map": PointMapConfig()}
+    return dataclasses.replace(model, **parts)
 
 
 def base_model_config(model: ModelConfig) -> ModelConfig:

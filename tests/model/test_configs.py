@@ -31,6 +31,6 @@ def test_configs_share_the_motion_features():
 def test_tiny_is_tiny_but_whole():
     cfg = _load("tiny")
     model = build_model(cfg, build_processor(cfg, ["put the mug into the fridge"] * 3, ["Mug"]))
-    assert 5e6 < sum(parameter.numel() for parameter in model.parameters()) < 8e6
+    assert 5e6 < sum(parameter.numel() for parameter in model.parameters()) < 1e7
     assert model.cse is not None
     assert model.point_map is not None

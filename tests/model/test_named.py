@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from proprio_mllm.model.batch import Batch, Collator, Example
+from proprio_mllm.model.batch import Batch, Collator, Example, Places
 from proprio_mllm.model.building import build_model, build_processor, load_model, save_model
 from proprio_mllm.model.chat import IMAGE, Message
 from proprio_mllm.model.cse import NamedPoints
@@ -30,12 +30,17 @@ def lookup() -> NamedPoints:
     return module
 
 
+def places(keys: torch.Tensor, values: torch.Tensor) -> Places:
+    """Cells that count alike."""
+    return Places(keys, values, torch.zeros(keys.shape[:2]))
+
+
 def test_a_word_gets_what_the_cell_holds_that_looks_like_it(lookup: NamedPoints) -> None:
     cells = torch.eye(8)[:4][None]  # four cells, each of another look
     held = torch.tensor([[[1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0]]])
     words = torch.stack([torch.eye(8)[6], 9.0 * cells[0, 2], 9.0 * cells[0, 1]])[None]  # the first looks like none
     with torch.no_grad():
-        given = lookup(words, 3.0 * cells, held)[0]
+        given = lookup(words, places(3.0 * cells, held))[0]
     assert float(given[0].abs().max()) < 1e-3
     torch.testing.assert_close(given[1, :2], held[0, 2], atol=1e-3, rtol=1e-3)
     torch.testing.assert_close(given[2, :2], held[0, 1], atol=1e-3, rtol=1e-3)
@@ -48,8 +53,8 @@ def test_a_name_of_several_words_is_looked_up_as_a_whole(lookup: NamedPoints) ->
     held = torch.tensor([[[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]])
     with torch.no_grad():
         lookup.bias.fill_(25.0)
-        given = lookup(torch.stack([coffee, machine, number])[None], cells, held)[0]
-        other = lookup(torch.stack([washing, machine, number])[None], cells, held)[0]
+        given = lookup(torch.stack([coffee, machine, number])[None], places(cells, held))[0]
+        other = lookup(torch.stack([washing, machine, number])[None], places(cells, held))[0]
     assert float(given[1, 0]) == pytest.approx(2.0, abs=1e-3)  # coffee machine, and not the machine by itself
     assert float(given[2, 0]) == pytest.approx(2.0, abs=1e-3)  # its number still belongs to it
     assert float(other[1, 0]) == pytest.approx(3.0, abs=1e-3)

@@ -88,21 +88,21 @@ def test_what_the_point_map_makes_of_an_image_is_computed_once(tmp_path, monkeyp
     rng = np.random.default_rng(0)
     views = [make_view(rng) for _ in range(3)]
     images = Collator(model.processor, cfg)([Example(tuple(looking([("a", "b")], None, "terse")), (v,)) for v in views]).images
-    plain, seen = model.spatial(images), list[int]()
+    plain, seen = model.spatial(images)[0], list[int]()
     model.point_map.register_forward_pre_hook(lambda module, inputs: seen.append(len(inputs[0])))
     model.keep_spatial()
-    first = model.spatial(part(images, [0, 2]))
+    first = model.spatial(part(images, [0, 2]))[0]
     torch.testing.assert_close(first.float(), plain[[0, 2]], atol=2e-3, rtol=2e-3)
-    again = model.spatial(images)  # one of them is new
+    again = model.spatial(images)[0]  # one of them is new
     assert torch.equal(again[[0, 2]], first) and seen == [2, 1]
     model.keep_spatial()  # another process
-    assert torch.equal(model.spatial(images), again) and seen == [2, 1]
+    assert torch.equal(model.spatial(images)[0], again) and seen == [2, 1]
     turned = dataclasses.replace(images, camera_in_pelvis=images.camera_in_pelvis + 0.1)
-    assert not torch.equal(model.spatial(turned), again) and seen == [2, 1, 3]
+    assert not torch.equal(model.spatial(turned)[0], again) and seen == [2, 1, 3]
     with torch.no_grad():
         next(model.point_map.parameters()).add_(0.1)
     model.keep_spatial()
-    assert not torch.equal(model.spatial(images), again) and seen == [2, 1, 3, 3]
+    assert not torch.equal(model.spatial(images)[0], again) and seen == [2, 1, 3, 3]
 
 
 def part(images, rows):

@@ -116,6 +116,9 @@ def test_pretrained_weights_read_episodes_as_english(trained: Pipeline, tmp_path
     shutil.copytree(trained.paths.root / "data", tmp_path / "tiny" / "data")
     shutil.rmtree(tmp_path / "tiny" / "data" / "practice")
     model = dataclasses.replace(trained.cfg.model, weights=str(weights))
+    with pytest.raises(ValueError, match=r"point_map\.encoder 'named'"):
+        dataclasses.replace(trained.cfg, model=model)
+    model = dataclasses.replace(model, point_map=dataclasses.replace(model.point_map, encoder="sim"))
     given = dataclasses.replace(trained.cfg, output=str(tmp_path), model=model)
     pipeline = Pipeline(STAGES, given, collect, "", None, Lessons())
     done = {stage: pipeline.run(stage) for stage in pipeline.stages}

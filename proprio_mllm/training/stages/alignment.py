@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from proprio_mllm.model.building import (
+    TRAINED_HERE,
     add_adapter,
     build_model,
     build_point_map,
@@ -33,7 +34,7 @@ class AlignmentStage:
     name = "alignment"
     needs = ("base", "practice", "pointmap", "tokenizer")
     shards = ("lessons",)
-    recipe = 13
+    recipe = 14
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The phases and the variant's model."""
@@ -69,7 +70,7 @@ def start(pipeline: Pipeline) -> ProprioMLLM:
     point_map = None
     if cfg.cse.enabled:
         point_map = seeded(lambda: build_point_map(cfg), pipeline.cfg.seed)
-        if point_map is not None and cfg.point_map.encoder == "sim":
+        if point_map is not None and cfg.point_map.encoder in TRAINED_HERE:
             point_map.load_state_dict(read_tensors(pipeline.paths.stage("pointmap") / "checkpoint" / "model.safetensors"))
     if cfg.weights is None:
         base = load_model(pipeline.paths.model("base"))

@@ -1,14 +1,24 @@
-"""Stage `pointmap`: the small point-map encoder learns from the simulator's own depth; other encoders come trained."""
+"""Stage `pointmap`: a small point-map encoder learns from the simulator's own depth; other encoders come trained."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from proprio_mllm.model.building import build_point_map
-from proprio_mllm.training.geometry_stage import PointMapObjective, point_map_error
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from interface.actions import ACTIONS
+from proprio_mllm.model.building import TRAINED_HERE, build_point_map, load_model
+from proprio_mllm.model.dense import DenseHead
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.named_map import NamedPointMap
+from proprio_mllm.model.word_tokens import tokens_of
+from proprio_mllm.model.wording import ID_NUMBERS, MARKERS, name_words
+from proprio_mllm.training.geometry_stage import NamedMapObjective, PointMapObjective, point_map_error
 from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded
 from proprio_mllm.training.sources import Views
 
@@ -17,9 +27,9 @@ class PointMapStage:
     """Metric points from single views."""
 
     name = "pointmap"
-    needs = ()
+    needs = ("practice",)
     shards = ("views",)
-    recipe = 0
+    recipe = 1
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The loop and the encoder."""
@@ -32,7 +42,23 @@ class PointMapStage:
         if encoder is None or not list(encoder.parameters()):
             return {}
         views = Views(pipeline.paths.shards("views"), pipeline.cfg.model)
-        if pipeline.cfg.model.point_map.encoder == "sim":
+        names = None
+        if isinstance(encoder, NamedPointMap):
+            names = names_of(load_model(pipeline.paths.model("practice")), views.type_names)
+            objective = NamedMapObjective(encoder, views, names, key)
+        else:
+            objective = PointMapObjective(encoder, views, key)
+        if pipeline.cfg.model.point_map.encoder in TRAINED_HERE:
             encoder.requires_grad_(True)
-            pipeline.loop(PointMapObjective(encoder, views, key), pipeline.cfg.pointmap, folder)
-        return point_map_error(encoder, views)
+            pipeline.loop(objective, pipeline.cfg.pointmap, folder)
+        return point_map_error(encoder.eval(), views, names)
+
+
+@torch.no_grad()
+def names_of(model: ProprioMLLM, types: Sequence[str]) -> Tensor:
+    """Unit rows (C + M, D) of a language model's table: of the names of types, and of words of the grammar that are in none."""
+    tokens, names = tokens_of(model.processor.tokenizer), [name_words(name) for name in types]
+    parts = {part for name in names for part in name}
+    others = [(word,) for word in (*MARKERS, *ACTIONS, *ID_NUMBERS) if word not in parts]
+    rows = DenseHead([tokens.tokens(name) for name in (*names, *others)]).names(model.table)
+    return functional.normalize(rows.float(), dim=-1)
