@@ -39,6 +39,7 @@ from proprio_mllm.training.sources import Views, held_out, key_bodies_of
 
 #: Smallest object that is asked about, pixels, as in training.
 _PIXELS: Final = 6
+_ASKED: Final = ("side", "arm", "distance", "height", "reach", "shift")
 _HANDS: Final = [KEY_BODIES.index(f"{side}_hand") for side in ("left", "right")]
 Ids = tuple[int, ...]
 
@@ -79,7 +80,7 @@ class Seen:
 
 def answers_about(point: NDArray[np.floating], bodies: NDArray[np.floating]) -> dict[str, str]:
     """Every question's answer about a point (3,) of the pelvis heading frame."""
-    return {kind: answer(point, bodies).partition("(")[0] for kind, answer in ANSWERS.items()}
+    return {kind: ANSWERS[kind](point, bodies).partition("(")[0] for kind in _ASKED}
 
 
 def ids_of(cell: tuple[int, int], grid: int, camera: Camera, bodies: NDArray[np.float64]) -> dict[str, Ids]:

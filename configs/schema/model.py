@@ -211,6 +211,8 @@ class ModelConfig:
             `weights`, and the extra `four-bit`.
         sees: whether a picture stands before each answer of an episode (`proprio_mllm.model.wording`).
         proprioception: whether motion tokens do too.
+        places: whether an answer says where the thing is that it is about, if that is in view, before its step; learnt from
+            what the point map makes of the picture.
     """
 
     name: str
@@ -222,6 +224,7 @@ class ModelConfig:
     dtype: Literal["float32", "bfloat16"] = "float32"
     four_bit: bool = False
     proprioception: bool = True
+    places: bool = False
     text: TinyTextConfig = field(default_factory=TinyTextConfig)
     vision: TinyVisionConfig = field(default_factory=TinyVisionConfig)
     lora: LoraConfig = field(default_factory=LoraConfig)

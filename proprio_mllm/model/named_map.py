@@ -146,10 +146,17 @@ class NamedPointMap(nn.Module):
         return grid if tuple(size) == (side, side) else functional.interpolate(grid, size=tuple(size), mode="bilinear")
 
 
-def centres_of(named: Named, name: Tensor, scale: Tensor) -> Tensor:
-    """Centres (I, 3) in the camera frame that a name's unit row (D,) looks up, with a factor of its cosines."""
-    shares = (scale * (named.keys @ name) + named.conf.log()).flatten(1).softmax(1)
-    return torch.einsum("in,inp->ip", shares, named.centres_m.flatten(1, 2))
+def centres_of(named: Named, names: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Centres (I, 3) in the camera frame that a name looks up in each picture, and its cosine (I, h * w) with every cell.
+
+    Args:
+        named: of I pictures.
+        names: (I, D) unit rows.
+        scale: factor of cosines.
+    """
+    cosine = torch.einsum("ihwd,id->ihw", named.keys, names).flatten(1)
+    shares = (scale * cosine + named.conf.log().flatten(1)).softmax(1)
+    return torch.einsum("in,inp->ip", shares, named.centres_m.flatten(1, 2)), cosine
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from interface.bodies import KEY_BODIES
 from interface.steps import Action
 from proprio_mllm.model.geometry import arm_length_m
 from proprio_mllm.model.prompts import Style
-from proprio_mllm.model.wording import id_words
+from proprio_mllm.model.wording import id_words, place_words
 
 #: Bearing within which an object counts as ahead, degrees.
 AHEAD_DEG = 8.0
@@ -46,6 +46,10 @@ QUESTIONS: Mapping[str, Mapping[Style, str]] = {
     "arm": {"terse": "Pick {}", "full": "Which arm reaches {} better: left, right or either?"},
     "reach": {"terse": "far {}", "full": "Which arms are long enough to reach {} from here: left, right, both or none?"},
     "see": {"terse": "see?", "full": "Which objects do you see, from left to right? Give their ids."},
+    "place": {
+        "terse": "at {}",
+        "full": "Where is {}? Give bearing and distance from you and height above the floor.",
+    },
     "shift": {"terse": "MoveDown {}", "full": "How must your height change to work on {}? Give MoveDown, MoveUp or none."},
 }
 
@@ -130,6 +134,12 @@ def shift_answer(center: NDArray[np.floating], key_bodies: NDArray[np.floating])
     return Action("MoveDown" if shift < 0 else "MoveUp", amount=round(min(abs(shift), 1.0), 3)).to_text()
 
 
+def place_answer(center: NDArray[np.floating], key_bodies: NDArray[np.floating]) -> str:
+    """`place_words` without the word that opens them, in the tokens of episodes (`spoken`)."""
+    words = place_words(center, float(np.asarray(key_bodies)[:, 2].min()))
+    return "".join(f" {word} " for word in words[1:]).rstrip()
+
+
 #: The true answer of each kind of question about an object, from its centre (3,) and the robot's own bodies (K, 3).
 ANSWERS: Final[Mapping[str, Callable[[NDArray[np.floating], NDArray[np.floating]], str]]] = {
     "side": lambda center, _: side_answer(center),
@@ -138,4 +148,5 @@ ANSWERS: Final[Mapping[str, Callable[[NDArray[np.floating], NDArray[np.floating]
     "height": lambda center, _: height_answer(center),
     "reach": reach_answer,
     "shift": shift_answer,
+    "place": place_answer,
 }

@@ -4,7 +4,8 @@
     log      per step: the actions as they were taken, their codes, what came into view
     now      before an answer, and seen by that answer alone: the hands, where the robot stands, what is in view, where things
              are or were last seen, the states of doors and switches, what was tried from here; `why` asks for reflection
-    answer   after `why`, of what type the failure is and what changes; the sub-goal (verb and thing), then the step
+    answer   after `why`, of what type the failure is and what changes; the sub-goal (verb and thing); where a model says where
+             things are (`model.places`), the place of that thing if it is in view; then the step
 
 Ids and instructions share their words (`DiningTable_1` is `dining table _1`), so that a thing is named by copying, not by
 remembering. Nothing is in these words that an `Observation` does not hold; `now` is computed from the log by the table of
@@ -15,10 +16,14 @@ The paper does not publish its prompts; the wording is ours.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from interface.actions import ACTIONS, ActionKind
 from interface.belief import ARM_SPECIFIC, UNKNOWN, Belief
@@ -46,6 +51,8 @@ MARKERS: Final = (
     "fail", "tried", "far", "up", "down", "top", "bottom", "low", "blocked", "many", "bent", "s", "ok", "why", "so",
     *CAUSES, *CHANGES,
 )  # fmt: skip
+#: Steps of the numbers of a place: degrees, and metres up to the last that is said.
+_PLACE_DEG, _PLACE_M, _PLACE_FAR_M = 10, 0.1, 2.0
 _TYPE_WORD: Final = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z0-9]+|[A-Z]+")
 _TEXT_WORD: Final = re.compile(r"[a-z0-9]+|[,.;:]")
 _STATES: Final[Mapping[Condition, tuple[str, str]]] = {
@@ -114,6 +121,30 @@ def _metres(value: float) -> str:
 
 def _degrees(value: float) -> str:
     return f"{min(max(round(value / 5.0), -36), 36) * 5}d"
+
+
+def place_words(center: NDArray[np.floating], floor_m: float) -> Words:
+    """Where a thing is: bearing, positive to the left, distance from the pelvis in the floor plane, and height above the floor.
+
+    Args:
+        center: (3,) pelvis heading frame, metres.
+        floor_m: height of the floor in that frame.
+    """
+    x, y, z = (float(one) for one in center)
+    bearing = round(math.degrees(math.atan2(y, x)) / _PLACE_DEG) * _PLACE_DEG
+    return ("at", f"{bearing}d", _place_m(math.hypot(x, y)), _place_m(z - floor_m))
+
+
+def _place_m(value: float) -> str:
+    return f"{min(max(round(value / _PLACE_M), 1) * _PLACE_M, _PLACE_FAR_M):.2f}"
+
+
+#: The words that a place may have, one after the other.
+PLACES: Final = (
+    ("at",),
+    tuple(f"{angle}d" for angle in range(-180, 181, _PLACE_DEG)),
+    *[tuple(_place_m(step * _PLACE_M) for step in range(1, round(_PLACE_FAR_M / _PLACE_M) + 1))] * 2,
+)
 
 
 def _count(value: int) -> str:
@@ -237,7 +268,7 @@ def _change(failed: Action, step: PlanStep) -> str:
     return "arm" if same else "other"
 
 
-def answer_words(verb: str, target: str | None, step: PlanStep, reflection: Words = ()) -> Words:
+def answer_words(verb: str, target: str | None, step: PlanStep, reflection: Words = (), place: Words = ()) -> Words:
     """The sub-goal and the step.
 
     Args:
@@ -245,10 +276,11 @@ def answer_words(verb: str, target: str | None, step: PlanStep, reflection: Word
         target: its object, None while that has not been seen; empty for verbs without one.
         step: what to do now.
         reflection: from `reflection_words`, where the state asked why.
+        place: from `place_words`, where the target is seen and it is to be said.
     """
     thing: Words = ("unseen",) if target is None else id_words(target) if target else ()
     actions = [word for number, one in enumerate(step.actions) for word in (*(("&",) if number else ()), *_action_words(one))]
-    return (*reflection, verb, *thing, "do", *actions, END)
+    return (*reflection, verb, *thing, *place, "do", *actions, END)
 
 
 def read_step(words: Sequence[str], ids: Mapping[Words, str]) -> PlanStep:

@@ -14,7 +14,7 @@ from interface.belief import Belief
 from interface.bodies import Arm
 from interface.effects import Condition, Grasp, Walk
 from interface.steps import Action
-from proprio_mllm.model.wording import CAUSES, CHANGES, END, id_words, number_words
+from proprio_mllm.model.wording import CAUSES, CHANGES, END, PLACES, id_words, number_words
 from proprio_mllm.planners.furniture import CONTAINERS, FIXTURES, SEATS, SURFACES
 from proprio_mllm.planners.scripted.words import type_of
 
@@ -33,15 +33,16 @@ class AnswerGrammar:
             something to where it was looked for, and the end of the task unless hands have just done something. None leaves
             out none.
         reflects: whether an answer begins with a reflection.
+        places: whether it may say where its thing is.
     """
 
-    def __init__(self, ids: Sequence[str], belief: Belief | None = None, reflects: bool = False) -> None:
+    def __init__(self, ids: Sequence[str], belief: Belief | None = None, reflects: bool = False, places: bool = False) -> None:
         self.ids: Mapping[tuple[str, ...], str] = {id_words(name): name for name in ids}
-        self._belief, self._reflection = belief, _REFLECTION if reflects else ()
+        self._belief, self._reflection, self._places = belief, _REFLECTION if reflects else (), places
         #: Words of the reflection.
         self.reflected = len(self._reflection)
-        places = [name for name in ids if type_of(name) in (*SURFACES, *SEATS, *CONTAINERS)]
-        self._searched = frozenset() if belief is None else _searched(places, belief)
+        spots = [name for name in ids if type_of(name) in (*SURFACES, *SEATS, *CONTAINERS)]
+        self._searched = frozenset() if belief is None else _searched(spots, belief)
 
     def allowed(self, words: Sequence[str]) -> list[str]:
         """The words that may follow some words of an answer; none after its end."""
@@ -54,8 +55,12 @@ class AnswerGrammar:
             spec = ACTIONS[words[0]]
             if not spec.takes_object or words[-1] == "unseen":
                 return ["do"]
+            if PLACES[0][0] in words:
+                said = len(words) - words.index(PLACES[0][0])  # type: ignore[attr-defined]  # every sequence has index
+                return list(PLACES[said]) if said < len(PLACES) else ["do"]
             following = _next(words[1:], (one for one, name in self.ids.items() if self._may_be_wanted(spec, name)))
-            return [*following, "unseen"] if len(words) == 1 else following or ["do"]
+            after = [*PLACES[0], "do"] if self._places else ["do"]
+            return [*following, "unseen"] if len(words) == 1 else following or after
         skipped = self._searched if words[1] == "unseen" else frozenset()
         step = list(words[words.index("do") + 1 :])  # type: ignore[attr-defined]  # every sequence has index
         if step and step[-1] == END:

@@ -191,7 +191,8 @@ class WordsPlanner:
         turn = turn_example(self.model, state.log, now, seen, self.motion)
         belief = state.sightings.belief
         reflects = state.reflects and belief.failed is not None
-        return _Answer(AnswerGrammar(observation.known_objects, None if self.insist else belief, reflects), state, turn)
+        known, places = observation.known_objects, self.model.cfg.places
+        return _Answer(AnswerGrammar(known, None if self.insist else belief, reflects, places), state, turn)
 
     def _write(self, answers: Sequence[_Answer]) -> None:
         """Continues every answer to its end; what has been read of a log before is not read again for an answer alone."""

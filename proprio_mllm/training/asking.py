@@ -37,7 +37,7 @@ def replies(model: ProprioMLLM, asked: Sequence[Example], longest: int) -> list[
 
 def answer_shares(model: ProprioMLLM, name: str, asked: Sequence[Example], answers: Sequence[str]) -> dict[str, float]:
     """`<name>_accuracy`, the share of short answers that are right, and `<name>_majority`, that of the commonest answer."""
-    right = sum(reply == answer for reply, answer in zip(replies(model, asked, _SHORT), answers, strict=True))
+    right = sum(reply == answer.strip() for reply, answer in zip(replies(model, asked, _SHORT), answers, strict=True))
     commonest = max(Counter(answers).values(), default=0)
     count = max(len(answers), 1)
     return {f"{name}_accuracy": right / count, f"{name}_majority": commonest / count}

@@ -25,7 +25,7 @@ from proprio_mllm.training.asking import answer_shares
 from proprio_mllm.training.judging import judge_example
 from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.phrases import phrase
-from proprio_mllm.training.sources import BODY_RELATIVE, CELL, GROUNDING, Clips, Demos, ViewRow, Views
+from proprio_mllm.training.sources import CELL, GROUNDING, Clips, Demos, ViewRow, Views, asked_by
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordBatch, WordsObjective
 
@@ -203,7 +203,7 @@ def looking_around(
         codes: motion tokens before the first question, or None.
         listing: whether the list of what is in view follows; it does where there is nothing to ask.
     """
-    asked = views.asked(row, (*GROUNDING, *BODY_RELATIVE), questions, rng)
+    asked = views.asked(row, asked_by(views.cfg), questions, rng)
     pairs = [(one.question, one.answer) for one in asked]
     pairs += [views.listing(row)] if listing or not pairs else []
     return Example(looking(pairs, codes, views.style), (row.view,))

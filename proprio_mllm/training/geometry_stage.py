@@ -162,13 +162,13 @@ def _looked_up(
     """Whether the likest cell shows what a name names, and how far the centre looked up is from the true one, metres."""
     named = geo.named
     assert named is not None
-    for image, (types, true) in enumerate(zip(truth.types, truth.centres_m, strict=True)):
-        for kind in types.unique().tolist():
+    device = named.keys.device
+    for kind in truth.types.unique().tolist():
+        centres, cosine = centres_of(named, names[kind].to(device).expand(len(truth.types), -1), encoder.scale.exp())
+        for types, true, place, likeness in zip(truth.types, truth.centres_m, centres.cpu(), cosine.cpu(), strict=True):
             shows = types == kind
+            if kind < 0 or not bool(shows.any()):
+                continue
             centre = true[shows][0]
-            if kind < 0 or not bool((true[shows] == centre).all()) or float(centre.norm()) > near_m:
-                continue  # several of a name, or one far away
-            name = names[kind].to(named.keys.device)
-            cosine = (named.keys[image] @ name).flatten()
-            place = centres_of(named, name, encoder.scale.exp())[image].cpu()
-            yield bool(shows.flatten()[int(cosine.argmax())]), float((place - centre).norm())
+            if bool((true[shows] == centre).all()) and float(centre.norm()) < near_m:  # one of a name, and not far away
+                yield bool(shows.flatten()[int(likeness.argmax())]), float((place - centre).norm())

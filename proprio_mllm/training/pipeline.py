@@ -106,8 +106,8 @@ def variant_model(model: ModelConfig, variant: str) -> ModelConfig:
 
 
 def base_model_config(model: ModelConfig) -> ModelConfig:
-    """The plain backbone: no MPE, no CSE, no proprioception."""
-    return variant_model(model, "no_proprio")
+    """The plain backbone: no MPE, no CSE, no proprioception; it does not say where things are."""
+    return dataclasses.replace(variant_model(model, "no_proprio"), places=False)
 
 
 def seeded(make: Callable[[], Any], seed: int) -> Any:

@@ -38,6 +38,11 @@ GROUNDING = ("side", "distance", "height")
 BODY_RELATIVE = ("arm", "reach", "shift")
 
 
+def asked_by(cfg: ModelConfig) -> tuple[str, ...]:
+    """The kinds of question that a model is asked about views."""
+    return (*GROUNDING, *BODY_RELATIVE, *(("place",) if cfg.places else ()))
+
+
 def held_out(key: str) -> bool:
     """Whether a row with this key belongs to the held-out part."""
     return int.from_bytes(hashlib.sha256(key.encode()).digest()[:4], "big") % HELD_OUT == 0
@@ -116,7 +121,7 @@ class Views:
             else tuple(self.reader.manifest.metadata["type_names"])
         )
         self.style: Style = cfg.prompt
-        self._cfg = cfg
+        self.cfg = cfg
 
     def row(self, index: int) -> ViewRow:
         """Decodes one row."""
@@ -125,7 +130,7 @@ class Views:
         motion = decode_motion(row["motion"])
         camera = _camera(row, row["camera_in_pelvis"])
         points = unproject(decode_depth(row["depth"], height, width), camera.intrinsics)
-        oracle = points if self._cfg.point_map.encoder == "oracle" else None
+        oracle = points if self.cfg.point_map.encoder == "oracle" else None
         view = View(decode_png(row["image"]), camera, key_bodies_of(motion), oracle)
         objects = tuple(json.loads(row["objects"]))
         return ViewRow(view, motion, objects, decode_segmentation(row["segmentation"], height, width), points)

@@ -8,7 +8,7 @@ them (`Collator.beside`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -22,7 +22,8 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.observing import pictured_turn
 from proprio_mllm.model.word_tokens import tokens_of
-from proprio_mllm.model.wording import WordEpisode
+from proprio_mllm.model.wording import WordEpisode, Words
+from proprio_mllm.training.placing import thing_of
 from proprio_mllm.training.sources import Demos
 from proprio_mllm.training.words import LONGEST_LOG
 
@@ -42,6 +43,7 @@ class Turns:
         folders: where the rows come from.
         told: the teacher's answers to every episode of a folder; the k-th turn is the k-th row's.
         tokens: the motion tokenizer; None for models without proprioception.
+        places: finds the things that answers are about (`proprio_mllm.training.placing`); None for models that do not say so.
 
     Attributes:
         train: rows that have an answer and are learnt from.
@@ -56,6 +58,7 @@ class Turns:
         folders: Sequence[Path],
         told: Callable[[Path], Sequence[WordEpisode]],
         tokens: MotionTokenizer | None = None,
+        places: Callable[[Sequence[tuple[int, Words]]], Mapping[int, Words]] | None = None,
     ) -> None:
         self._model, self._demos = model, demos
         self.codes = None if tokens is None else demos.tokens(tokens)
@@ -64,12 +67,19 @@ class Turns:
         weights = np.ones(len(names))
         starts = [row for row, name in enumerate(names) if row == 0 or name != names[row - 1]]
         episodes = [episode for folder in folders for episode in told(folder)]
+        turns = {start + k: turn for start, one in zip(starts, episodes, strict=True) for k, turn in enumerate(one.turns)}
+        things = [(row, thing_of(turn.answer)) for row, turn in turns.items() if turn.answer] if places else []
+        found = places([(row, thing) for row, thing in things if thing]) if places else {}
         for start, episode in zip(starts, episodes, strict=True):
             words = tokens_of(model.processor.tokenizer)
             log = words.tokens(episode.prefix)
             for number, turn in enumerate(episode.turns):
+                answer, place = turn.answer, found.get(start + number, ())
+                if place:
+                    do = answer.index("do")
+                    answer = (*answer[:do], *place, *answer[do:])
                 if len(log) <= LONGEST_LOG * words.length:  # as in stage `words`
-                    self._told[start + number] = (list(log), words.tokens(turn.now), words.tokens(turn.answer))
+                    self._told[start + number] = (list(log), words.tokens(turn.now), words.tokens(answer))
                 log += words.tokens(turn.taken)
                 weights[start + number] = _TRIED if turn.tries else 1.0
         rows = np.array(sorted(self._told), dtype=np.int64)

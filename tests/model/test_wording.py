@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from interface.failures import FAILED
@@ -10,9 +11,12 @@ from interface.sightings import Shown, Sightings
 from interface.steps import PlanStep
 from proprio_mllm.model.wording import (
     MARKERS,
+    PLACES,
     answer_words,
     id_words,
     log_words,
+    number_words,
+    place_words,
     prefix_words,
     read_step,
     reflection_words,
@@ -121,3 +125,24 @@ def test_answers(verb: str, target: str | None, step: str, words: str) -> None:
     written = answer_words(verb, target, PlanStep.parse(step))
     assert " ".join(written) == words
     assert read_step(written, {id_words(name): name for name in ("Mug_1", "Egg_1", "Fridge_2")}) == PlanStep.parse(step)
+
+
+@pytest.mark.parametrize(
+    ("center", "words"),
+    [
+        ((0.6, 0.0, 0.3), "at 0d 0.60 0.90"),
+        ((0.3, -0.3, -0.58), "at -40d 0.40 0.10"),  # halves go to the even one
+        ((0.0, 5.0, 9.0), "at 90d 2.00 2.00"),
+        ((-1.0, -1e-9, -0.6), "at -180d 1.00 0.10"),
+    ],
+)
+def test_places(center: tuple[float, float, float], words: str) -> None:
+    written = place_words(np.array(center), -0.6)
+    assert " ".join(written) == words
+    assert all(word in may for word, may in zip(written, PLACES, strict=True))
+    assert {word for may in PLACES[1:] for word in may} <= set(number_words())
+    step = PlanStep.parse("MoveDown(0.2)")
+    assert answer_words("Pick", "Mug_1", step, ("body", "so", "height"), written)[:10] == (
+        *("body", "so", "height", "Pick", "mug", "_1"),
+        *written,
+    )

@@ -9,7 +9,7 @@ from interface.actions import ACTIONS
 from interface.belief import Belief
 from interface.observation import HistoryItem
 from interface.steps import PlanStep
-from proprio_mllm.model.wording import END, answer_words, read_step
+from proprio_mllm.model.wording import END, PLACES, answer_words, place_words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
 
 IDS = ("DiningTable_1", "DiningTable_2", "Mug_1", "TVStand_1", "Fridge_1", "Zubo_1")
@@ -46,6 +46,18 @@ def test_a_reflection_comes_first_where_it_is_asked_for() -> None:
     assert not said(answer_words("Pick", "Mug_1", step), reflecting)
     assert reflecting.allowed(words) == [] and reflecting.allowed(words[:3]) == AnswerGrammar(IDS).allowed(())
     assert read_step(words, reflecting.ids) == step
+
+
+def test_a_place_stands_before_the_step_where_it_may_be_said() -> None:
+    step, places = PlanStep.parse("MoveDown(0.2)"), AnswerGrammar(IDS, places=True)
+    place = place_words(np.array([0.5, 0.2, 0.3]), -0.6)
+    words = answer_words("Pick", "Mug_1", step, place=place)
+    assert said(words, places) and not said(words, AnswerGrammar(IDS))
+    assert said(answer_words("Pick", "Mug_1", step), places)  # it need not be said
+    assert said(answer_words("Pick", None, step), places)
+    assert "at" not in places.allowed(("Pick", "unseen"))
+    assert places.allowed(words[:6]) == list(PLACES[3]) and places.allowed(words[:7]) == ["do"]
+    assert read_step(words, places.ids) == step
 
 
 @pytest.mark.parametrize(

@@ -8,22 +8,19 @@ from pathlib import Path
 from typing import Any
 
 from proprio_mllm.model.building import (
-    TRAINED_HERE,
     add_adapter,
     build_model,
-    build_point_map,
     build_processor,
     load_model,
 )
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.tensors import read_tensors
 from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, body_state_accuracy
 from proprio_mllm.training.base import grounding_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded, variant_model
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
-from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
+from proprio_mllm.training.sources import Clips, Views, asked_by
+from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, point_map_of, turns_of
 from proprio_mllm.training.turns import turn_accuracy
 from proprio_mllm.training.words import held_out_metrics
 
@@ -58,7 +55,7 @@ class AlignmentStage:
             objective = AlignmentObjective(model, data, phase, pipeline.cfg.alignment, f"{key}/{phase}")
             pipeline.loop(objective, getattr(pipeline.cfg.alignment, phase), folder / phase)
         pipeline.store("alignment", model, read)
-        asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE), tokens=read)
+        asked = grounding_accuracy(model, views, asked_by(model.cfg), tokens=read)
         felt = {} if turns.codes is None else body_state_accuracy(model, demos, turns.codes)
         told = held_out_metrics(model, {"": pipeline.lessons.episode})
         return {**asked, **felt, **turn_accuracy(model, turns), **told}
@@ -67,11 +64,7 @@ class AlignmentStage:
 def start(pipeline: Pipeline) -> ProprioMLLM:
     """The base model with this variant's MPE and CSE and the trained point map."""
     cfg = dataclasses.replace(variant_model(pipeline.cfg.model, pipeline.cfg.variant), sees=True)
-    point_map = None
-    if cfg.cse.enabled:
-        point_map = seeded(lambda: build_point_map(cfg), pipeline.cfg.seed)
-        if point_map is not None and cfg.point_map.encoder in TRAINED_HERE:
-            point_map.load_state_dict(read_tensors(pipeline.paths.stage("pointmap") / "checkpoint" / "model.safetensors"))
+    point_map = point_map_of(pipeline, cfg) if cfg.cse.enabled else None
     if cfg.weights is None:
         base = load_model(pipeline.paths.model("base"))
         local = dataclasses.replace(cfg, weights=str(pipeline.paths.model("base") / "vlm"))

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from torch import nn
+
 from configs.schema.model import ModelConfig
+from proprio_mllm.model.building import TRAINED_HERE, build_point_map
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.training.pipeline import Pipeline
+from proprio_mllm.model.named_map import NamedPointMap
+from proprio_mllm.model.tensors import read_tensors
+from proprio_mllm.training.pipeline import Pipeline, seeded
+from proprio_mllm.training.placing import Places
 from proprio_mllm.training.sources import Demos
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordsObjective, mixed
@@ -34,5 +40,15 @@ def episodes_in_words(pipeline: Pipeline, model: ProprioMLLM, key: str) -> Words
 
 
 def turns_of(pipeline: Pipeline, model: ProprioMLLM, demos: Demos, tokens: MotionTokenizer | None = None) -> Turns:
-    """Decisions with pictures of the rows of `lessons_of`."""
-    return Turns(model, demos, lesson_folders(pipeline), pipeline.lessons.told, tokens)
+    """Decisions with pictures of the rows of `lessons_of`; with the places of things where the model says them."""
+    encoder = point_map_of(pipeline, pipeline.cfg.model) if model.cfg.places else None
+    places = Places(model, encoder, demos) if isinstance(encoder, NamedPointMap) else None
+    return Turns(model, demos, lesson_folders(pipeline), pipeline.lessons.told, tokens, places)
+
+
+def point_map_of(pipeline: Pipeline, cfg: ModelConfig) -> nn.Module | None:
+    """The trained point map, frozen."""
+    encoder = seeded(lambda: build_point_map(cfg), pipeline.cfg.seed)
+    if encoder is not None and cfg.point_map.encoder in TRAINED_HERE:
+        encoder.load_state_dict(read_tensors(pipeline.paths.stage("pointmap") / "checkpoint" / "model.safetensors"))
+    return encoder
