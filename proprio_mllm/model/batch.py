@@ -26,7 +26,7 @@ from torch.nn import functional
 from configs.schema.model import ModelConfig
 from interface.observation import Camera
 from proprio_mllm.model.chat import Encoded, Message, encode
-from proprio_mllm.model.geometry import above_floor_m, centroid
+from proprio_mllm.model.geometry import centroid, stance
 from proprio_mllm.model.mpe import Centroid, position_ids
 from proprio_mllm.model.processor import ProprioProcessor
 from proprio_mllm.model.vocabulary import MOTION_END, MOTION_START
@@ -101,7 +101,7 @@ class ImageBatch(Movable):
         grid: (h, w) of the merged tokens, the same for every image.
         centroids: the robot's place in each image as fractions, or None.
         camera_in_pelvis: (I, 4, 4), or None when some image has no camera.
-        above_floor_m: (I,) heights of the cameras above the lowest key body, or None when some image has no camera or no robot.
+        stance: (I, 3, 4) how the cameras stand (`geometry.stance`), or None when some image has no camera or no robot.
         points_m: (I, H, W, 3) true points, or None when some image has none.
     """
 
@@ -111,15 +111,8 @@ class ImageBatch(Movable):
     grid: tuple[int, int]
     centroids: tuple[Centroid | None, ...]
     camera_in_pelvis: Tensor | None = None
-    above_floor_m: Tensor | None = None
+    stance: Tensor | None = None
     points_m: Tensor | None = None
-
-    @property
-    def stance(self) -> Tensor | None:
-        """How the cameras stand (I, 4): which way is up in the camera frame, and the height above the floor, metres."""
-        if self.camera_in_pelvis is None or self.above_floor_m is None:
-            return None
-        return torch.cat([self.camera_in_pelvis[:, 2, :3], self.above_floor_m[:, None]], dim=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,6 +207,11 @@ class Batch(Movable):
         return int((self.labels[:, 1:] != IGNORE).sum())
 
 
+def _stacked(values: Sequence[NDArray[np.floating]], count: int) -> Tensor | None:
+    """Values of all images, or None when some have none."""
+    return torch.from_numpy(np.stack(values)).float() if len(values) == count else None
+
+
 class Collator:
     """Makes batches.
 
@@ -248,12 +246,8 @@ class Collator:
         grid_thw: Tensor = features["image_grid_thw"]
         h, w = (int(n) // self._merge for n in grid_thw[0, 1:])
         rgb = torch.from_numpy(np.stack([view.image for view in views])).permute(0, 3, 1, 2)
-        cameras = [view.camera.camera_in_pelvis for view in views if view.camera is not None]
-        heights = [
-            above_floor_m(view.camera, view.key_bodies)
-            for view in views
-            if view.camera is not None and view.key_bodies is not None
-        ]
+        poses = [view.camera.camera_in_pelvis for view in views if view.camera is not None]
+        stances = [stance(one.camera, one.key_bodies) for one in views if one.camera is not None and one.key_bodies is not None]
         points = [view.points_m for view in views if view.points_m is not None]
         return ImageBatch(
             pixel_values=features["pixel_values"],
@@ -261,9 +255,9 @@ class Collator:
             rgb=rgb.contiguous(),
             grid=(h, w),
             centroids=tuple(self._centroid(view) for view in views),
-            camera_in_pelvis=torch.from_numpy(np.stack(cameras)).float() if len(cameras) == len(views) else None,
-            above_floor_m=torch.tensor(heights) if len(heights) == len(views) else None,
-            points_m=torch.from_numpy(np.stack(points)).float() if len(points) == len(views) else None,
+            camera_in_pelvis=_stacked(poses, len(views)),
+            stance=_stacked(stances, len(views)),
+            points_m=_stacked(points, len(views)),
         )
 
     def _centroid(self, view: View) -> Centroid | None:

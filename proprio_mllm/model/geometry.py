@@ -77,9 +77,16 @@ def centroid(camera: Camera, key_bodies: NDArray[np.floating], provider: Centroi
     return x / camera.width, y / camera.height
 
 
-def above_floor_m(camera: Camera, key_bodies: NDArray[np.floating]) -> float:
-    """Height of the camera above the robot's lowest key body, which stands on the floor, metres."""
-    return float(camera.camera_in_pelvis[2, 3] - _check(key_bodies)[:, 2].min())
+def stance(camera: Camera, key_bodies: NDArray[np.floating]) -> NDArray[np.float64]:
+    """How a camera stands, (3, 4): where its rays go, and where it is above the floor.
+
+    The first three columns turn homogeneous pixels (x, y, 1) into directions in the pelvis heading frame. The last is the
+    camera's position in that frame, but for z its height above the robot's lowest key body, which stands on the floor, metres.
+    """
+    pose = np.asarray(camera.camera_in_pelvis, dtype=np.float64)
+    rays = pose[:3, :3] @ np.linalg.inv(np.asarray(camera.intrinsics, dtype=np.float64))
+    place = pose[:3, 3] - [0.0, 0.0, _check(key_bodies)[:, 2].min()]
+    return np.concatenate([rays, place[:, None]], axis=1)
 
 
 def unproject(depth_m: NDArray[np.floating], intrinsics: NDArray[np.floating]) -> NDArray[np.float32]:

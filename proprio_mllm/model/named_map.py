@@ -7,8 +7,8 @@ model's table of words, and a vote for the centre of the thing that it shows, as
 (LSeg; Li et al., 2022), but each name by itself, as in `proprio_mllm.model.dense`: a cosine has to tell whether a thing is in
 view at all.
 
-Distance in a single picture follows from where things stand on the floor, so the encoder is told how its camera stands: which
-way is up, and how far the floor is below, both from the robot's own joints.
+Distance in a single picture follows from where things stand on the floor, so the encoder is told how its camera stands: where
+each pixel's ray goes, and how far the floor is below, both from the robot's own joints.
 
 It is small, trained on the simulator's truth, and takes CUT3R's place at the tiny size; it is not CUT3R.
 
@@ -33,8 +33,8 @@ from proprio_mllm.model.point_map import GeoFeatures, Named, confident_loss, pix
 
 #: Rows and columns of pixels of a cell.
 STRIDE: Final = 8
-#: Heights of a camera above the floor are told as metres from this.
-_STANDING_M: Final = 1.0
+#: Heights of a camera above the floor are told from this, metres, and by this factor.
+_STANDING_M, _HEIGHTS = 1.0, 2.0
 _STEM, _QUARTER, _EIGHTH = 24, 48, 128
 
 
@@ -112,7 +112,7 @@ class NamedPointMap(nn.Module):
         Args:
             rgb: uint8.
             points_m: not read.
-            stance: (I, 4) from `ImageBatch.stance`.
+            stance: (I, 3, 4) from `geometry.stance`.
 
         Raises:
             ValueError: without stances.
@@ -125,8 +125,7 @@ class NamedPointMap(nn.Module):
         cols = torch.linspace(-1, 1, x.shape[3], device=x.device).view(1, 1, 1, -1).expand(len(x), 1, x.shape[2], -1)
         x = torch.cat([x, rows, cols], dim=1).contiguous(memory_format=torch.channels_last)
         quarter = self.quarter(self.stem(x))  # (I, _QUARTER, H/4, W/4)
-        told = (stance - stance.new_tensor([0.0, 0.0, 0.0, _STANDING_M])).to(quarter)[..., None, None]
-        eighth = self.eighth(torch.cat([quarter, told.expand(-1, -1, *quarter.shape[2:])], dim=1))
+        eighth = self.eighth(torch.cat([quarter, _rays(stance, quarter.shape[2:]).to(quarter)], dim=1))
         grid = self.sixteenth(eighth)
         tokens = (grid + self._at(grid.shape[2:])).flatten(2).transpose(1, 2)
         for block in self.blocks:
@@ -144,6 +143,16 @@ class NamedPointMap(nn.Module):
         side = math.isqrt(self.places.shape[1])
         grid = self.places.transpose(1, 2).unflatten(2, (side, side))
         return grid if tuple(size) == (side, side) else functional.interpolate(grid, size=tuple(size), mode="bilinear")
+
+
+def _rays(stance: Tensor, size: Sequence[int]) -> Tensor:
+    """Unit rays in the pelvis heading frame and the camera's height, (I, 4, rows, columns), for cells of 4 pixels."""
+    rows, columns = (4.0 * torch.arange(count, device=stance.device) + 2.0 for count in size)
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    rays = torch.einsum("iab,bhw->iahw", stance[:, :, :3], torch.stack([x, y, torch.ones_like(x)]))
+    rays = functional.normalize(rays, dim=1)
+    heights = _HEIGHTS * (stance[:, 2, 3] - _STANDING_M)
+    return torch.cat([rays, heights[:, None, None, None].expand(-1, 1, *rays.shape[2:])], dim=1)
 
 
 def centres_of(named: Named, names: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:

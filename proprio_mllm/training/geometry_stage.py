@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from proprio_mllm.model.batch import Movable
-from proprio_mllm.model.geometry import above_floor_m
+from proprio_mllm.model.geometry import stance
 from proprio_mllm.model.named_map import NamedPointMap, NamedTruth, centres_of, named_map_loss, named_truth
 from proprio_mllm.model.point_map import FAR_M, GeoFeatures, point_map_loss, read_at_centres
 from proprio_mllm.training.loop import Objective
@@ -74,7 +74,7 @@ class NamedMapObjective(Objective):
 
 @dataclass(frozen=True, slots=True)
 class NamedBatch(Movable):
-    """Views: images (I, 3, H, W), how their cameras stand (I, 4), and what is where."""
+    """Views: images (I, 3, H, W), how their cameras stand (I, 3, 4), and what is where."""
 
     rgb: Tensor
     stance: Tensor
@@ -98,9 +98,9 @@ def named_batch(views: Views, rows: Sequence[ViewRow]) -> NamedBatch:
             for one in things
         ]
         fields.append(named_truth(row.points_m, row.segmentation, centres))
-        stances.append([*pose[2, :3], above_floor_m(camera, bodies)])
+        stances.append(stance(camera, bodies))
     truth = NamedTruth(*(torch.from_numpy(np.stack(one)) for one in zip(*fields, strict=True)))
-    return NamedBatch(_stack(rows)[0], torch.tensor(stances, dtype=torch.float32), truth)
+    return NamedBatch(_stack(rows)[0], torch.from_numpy(np.stack(stances)).float(), truth)
 
 
 def _stack(rows: Sequence[ViewRow]) -> tuple[Tensor, Tensor]:

@@ -9,11 +9,13 @@ import pytest
 import torch
 from torch.nn import functional
 
+from interface.observation import Camera
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import build_model, build_processor, load_model, save_model
 from proprio_mllm.model.chat import IMAGE, Message
+from proprio_mllm.model.geometry import stance
 from proprio_mllm.model.modeling import ProprioMLLM
-from proprio_mllm.model.named_map import NamedPointMap, NamedTruth, centres_of, named_map_loss, named_truth
+from proprio_mllm.model.named_map import NamedPointMap, NamedTruth, _rays, centres_of, named_map_loss, named_truth
 from proprio_mllm.model.word_tokens import add_word_tokens, tokens_of
 from tests.model.conftest import TEXTS, TYPES, make_view, small
 
@@ -59,9 +61,23 @@ def test_pictures_of_other_sizes_have_places_between_those_learnt() -> None:
     assert module._at((2, 2))[0, 0].tolist() == [[0.0, 1.0], [2.0, 3.0]]
     finer = module._at((4, 4))[0, 0]
     assert bool((finer.diff(dim=0) >= 0).all()) and bool((finer.diff(dim=1) >= 0).all())
-    geo = module(torch.zeros(1, 3, 64, 48, dtype=torch.uint8), None, torch.zeros(1, 4))
+    geo = module(torch.zeros(1, 3, 64, 48, dtype=torch.uint8), None, torch.eye(3, 4)[None])
     assert geo.named is not None
     assert geo.named.keys.shape == (1, 8, 6, 16)
+
+
+def test_it_is_told_where_rays_go_and_how_far_the_floor_is() -> None:
+    camera = Camera(np.array([[100.0, 0, 16], [0, 100, 24], [0, 0, 1]]), np.eye(4), 48, 32)
+    camera.camera_in_pelvis[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # looks ahead
+    camera.camera_in_pelvis[:3, 3] = [0.2, 0.0, 0.5]
+    bodies = np.zeros((14, 3))
+    bodies[3, 2] = -0.9
+    told = torch.from_numpy(stance(camera, bodies)).float()[None]
+    planes = _rays(told, (12, 8))[0]
+    assert planes.shape == (4, 12, 8)
+    torch.testing.assert_close(planes[3], torch.full((12, 8), 2.0 * (1.4 - 1.0)))
+    at = torch.tensor([1.0, -(4 * 5 + 2.0 - 16) / 100, -(4 * 9 + 2.0 - 24) / 100])  # row 9, column 5
+    torch.testing.assert_close(planes[:3, 9, 5], functional.normalize(at, dim=0))
 
 
 def test_names_find_the_centres_of_what_they_name() -> None:
@@ -70,7 +86,8 @@ def test_names_find_the_centres_of_what_they_name() -> None:
     names, module = functional.normalize(torch.randn(2, 16), dim=-1), encoder()
     rgb = torch.full((4, 3, 32, 32), 90, dtype=torch.uint8)
     types, centres = torch.full((4, 4, 4), -1), torch.full((4, 4, 4, 3), torch.nan)
-    stance = torch.tensor([[0.0, -1.0, 0.0, 1.0 + 0.2 * (image // 2)] for image in range(4)])
+    stance = torch.eye(3, 4).repeat(4, 1, 1)
+    stance[:, 2, 3] = torch.tensor([1.0, 1.0, 1.2, 1.2])
     for image in range(4):
         for kind, column in enumerate((0, 2) if image % 2 else (2, 0)):
             rgb[image, kind, 8:24, 8 * column : 8 * column + 16] = 255
@@ -90,7 +107,7 @@ def test_names_find_the_centres_of_what_they_name() -> None:
     for kind, columns in enumerate(((2, 0, 2, 0), (0, 2, 0, 2))):
         true = torch.tensor([[column - 1.0, 0.0, 1.0 + image // 2] for image, column in enumerate(columns)])
         found, _ = centres_of(geo.named, names[kind].expand(4, -1), module.scale.exp())
-        torch.testing.assert_close(found, true, atol=0.15, rtol=0.0)
+        torch.testing.assert_close(found, true, atol=0.3, rtol=0.0)
 
 
 @pytest.fixture
