@@ -27,6 +27,8 @@ from proprio_mllm.model.point_map import GeoFeatures
 
 #: Points beyond this are held to it, metres.
 FAR_M = 10.0
+#: Factor of scores in means over cells: most cells of a picture are unlike a name, and would outweigh the few that are like it.
+SHARP = 2.0
 #: Most words of a name.
 NAME_WORDS = 3
 
@@ -57,7 +59,7 @@ class CrossSpatialEncoder(nn.Module):
             nn.init.zeros_(last.bias)
         #: Whether words look into the point map itself.
         self.names = names and cfg.named
-        self.named = NamedPoints(token_dim + 8 if names else inputs, hidden) if cfg.named else None
+        self.named = NamedPoints(8 if names else inputs, hidden) if cfg.named else None
 
     def spatial(self, geo: GeoFeatures, h: int, w: int, camera_in_pelvis: Tensor | None) -> Tensor:
         """F3D on the merged grid, (I, N, inputs of Phi).
@@ -112,11 +114,10 @@ class CrossSpatialEncoder(nn.Module):
             return None
         if not self.names:
             return Places(visual, spatial, spatial.new_zeros(spatial.shape[:2]))
-        assert geo is not None and geo.named is not None and geo.tokens is not None
-        values = [
+        assert geo is not None and geo.named is not None
+        values = [  # no tokens: among 128 channels of them a place is not found
             self._planes(geo.named.centres_m, geo.named.conf, camera_in_pelvis),
             self._planes(geo.points_m, geo.conf, camera_in_pelvis),
-            geo.tokens.float().permute(0, 2, 3, 1),
         ]
         return Places(geo.named.keys.flatten(1, 2), torch.cat(values, -1).flatten(1, 2), geo.named.conf.log().flatten(1, 2))
 
@@ -145,6 +146,12 @@ class NamedPoints(nn.Module):
         self.bias = nn.Parameter(torch.tensor(-5.0))
         self.put = nn.Sequential(nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, hidden))
 
+    @torch.no_grad()
+    def score_like(self, scale: Tensor, bias: Tensor) -> None:
+        """Starts from the logarithm of a factor and the bias with which keys were trained."""
+        self.scale.copy_(scale)
+        self.bias.copy_(bias)
+
     def forward(self, words: Tensor, places: Places) -> Tensor:
         """What is added to the embeddings of words (B, W, D).
 
@@ -162,5 +169,5 @@ class NamedPoints(nn.Module):
         best = cosine.amax(-1).argmax(0)  # (B, W)
         scores = cosine.gather(0, best[None, ..., None].expand(1, *cosine.shape[1:]))[0].float() * self.scale.exp()
         gate = (scores.amax(-1, keepdim=True) + self.bias).sigmoid()
-        shares = (scores + places.trust[:, None]).softmax(-1).to(own)
+        shares = (SHARP * scores + places.trust[:, None]).softmax(-1).to(own)
         return gate * self.put(shares @ places.values.to(own))

@@ -90,6 +90,8 @@ class ProprioMLLM(nn.Module):
             encoder: Any = point_map
             self.cse = CrossSpatialEncoder(cfg.cse, hidden, int(encoder.token_dim), isinstance(encoder, NamedPointMap))
             point_map.requires_grad_(False)
+            if isinstance(point_map, NamedPointMap) and self.cse.named is not None:
+                self.cse.named.score_like(point_map.scale, point_map.bias)
         self.mpe = SignEmbedding(hidden) if cfg.mpe.mode in ("embed_sign", "rope_sign+embed") else None
         tokenizer = processor.tokenizer
         names = ("<|image_pad|>", "<|video_pad|>", "<|vision_start|>", "<|vision_end|>", "<|vision_pad|>", "<|im_start|>")

@@ -4,8 +4,8 @@ A planner needs where a thing is, by its name, and a point map of surfaces does 
 So each cell of this encoder holds, beside the surface's point and a token, a key that is compared with rows of the language
 model's table of words, and a vote for the centre of the thing that it shows, as VoteNet's points vote for the centres of boxes
 (Qi et al., 2019). `cse.NamedPoints` looks centres up by name. Keys are trained like those of language-driven segmentation
-(LSeg; Li et al., 2022), but each name by itself, as in `proprio_mllm.model.dense`: a cosine has to tell whether a thing is in
-view at all.
+(LSeg; Li et al., 2022) by the softmax over all names, which tells things apart, and each name by itself as well, as in
+`proprio_mllm.model.dense`: a cosine has to tell whether a thing is in view at all.
 
 Distance in a single picture follows from where things stand on the floor, so the encoder is told how its camera stands: where
 each pixel's ray goes, and how far the floor is below, both from the robot's own joints.
@@ -29,6 +29,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from proprio_mllm.model.batch import Movable
+from proprio_mllm.model.cse import SHARP
 from proprio_mllm.model.point_map import GeoFeatures, Named, confident_loss, pixels, points_and_confidence
 
 #: Rows and columns of pixels of a cell.
@@ -164,7 +165,7 @@ def centres_of(named: Named, names: Tensor, scale: Tensor) -> tuple[Tensor, Tens
         scale: factor of cosines.
     """
     cosine = torch.einsum("ihwd,id->ihw", named.keys, names).flatten(1)
-    shares = (scale * cosine + named.conf.log().flatten(1)).softmax(1)
+    shares = (SHARP * scale * cosine + named.conf.log().flatten(1)).softmax(1)
     return torch.einsum("in,inp->ip", shares, named.centres_m.flatten(1, 2)), cosine
 
 
@@ -250,6 +251,8 @@ def named_map_loss(encoder: NamedPointMap, geo: GeoFeatures, truth: NamedTruth, 
     scores = encoder.scale.exp() * (geo.named.keys @ names.T) + encoder.bias  # (I, h, w, C + M)
     told = functional.one_hot(truth.types + 1, len(names) + 1)[..., 1:].to(scores)
     each = functional.binary_cross_entropy_with_logits(scores, told, reduction="none").sum(-1)
+    against = functional.pad(scores, (1, 0)).flatten(0, -2)  # all names at once, 0 for showing none of them
+    each = each + functional.cross_entropy(against, (truth.types + 1).flatten(), reduction="none").view_as(each)
     weights = truth.weights.clamp_min(_PLAIN)
     right = ((scores.argmax(-1) == truth.types) & shown).sum() / shown.sum().clamp_min(1)
     return surface + centre + _NAMES * (each * weights).sum() / weights.sum(), float(right)

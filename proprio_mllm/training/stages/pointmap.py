@@ -29,7 +29,7 @@ class PointMapStage:
     name = "pointmap"
     needs = ("practice",)
     shards = ("views",)
-    recipe = 2
+    recipe = 3
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The loop and the encoder."""
