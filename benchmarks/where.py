@@ -31,7 +31,7 @@ from interface.bodies import KEY_BODIES
 from interface.observation import Camera
 from proprio_mllm.model.batch import Collator
 from proprio_mllm.model.building import load_model
-from proprio_mllm.model.geometry import centroid, project
+from proprio_mllm.model.geometry import centroid, project, to_pelvis
 from proprio_mllm.model.mpe import relative_cells
 from proprio_mllm.model.questions import ANSWERS
 from proprio_mllm.report.statistics import wilson
@@ -39,7 +39,7 @@ from proprio_mllm.training.sources import Views, held_out, key_bodies_of
 
 #: Smallest object that is asked about, pixels, as in training.
 _PIXELS: Final = 6
-_ASKED: Final = ("side", "arm", "distance", "height", "reach", "shift")
+_ASKED: Final = tuple(kind for kind in ANSWERS if kind != "place")  # whose answers are words
 _HANDS: Final = [KEY_BODIES.index(f"{side}_hand") for side in ("left", "right")]
 Ids = tuple[int, ...]
 
@@ -151,7 +151,6 @@ def told_by_points(options: Options) -> dict[str, dict[str, tuple[int, int]]]:
         row = views.row(int(index))
         bodies, camera = row.view.key_bodies, row.view.camera
         assert bodies is not None and camera is not None
-        pose = np.asarray(camera.camera_in_pelvis, dtype=np.float64)
         images = collate.images([row.view])
         own = model.point_map(images.rgb, None, images.stance).points_m[0].numpy()
         for centre, i, j in cells_of(row.objects, camera, options.grid):
@@ -162,7 +161,7 @@ def told_by_points(options: Options) -> dict[str, dict[str, tuple[int, int]]]:
                     for k, size in zip((i, j), points.shape, strict=False)
                 )
                 point = points[rows, columns].reshape(-1, 3).mean(0)
-                answers = answers_about(pose[:3, :3] @ point + pose[:3, 3], bodies)
+                answers = answers_about(to_pelvis(camera, point), bodies)
                 for question, answer in answers.items():
                     counts[source][question].append(answer == truth[question])
     return {source: {key: (sum(all_), len(all_)) for key, all_ in found.items()} for source, found in counts.items()}

@@ -62,10 +62,26 @@ def body_point_in_pelvis(key_bodies: NDArray[np.floating], provider: CentroidNam
     raise ValueError(f"centroid provider {provider!r} is not allowed; allowed: body, arms, reach")
 
 
+def to_camera(camera: Camera, point_in_pelvis: NDArray[np.floating]) -> NDArray[np.float64]:
+    """A point (3,) of the pelvis heading frame in the camera frame, metres."""
+    pose = np.asarray(camera.camera_in_pelvis, dtype=np.float64)
+    return pose[:3, :3].T @ (np.asarray(point_in_pelvis, dtype=np.float64) - pose[:3, 3])
+
+
+def to_pelvis(camera: Camera, point_in_camera: NDArray[np.floating]) -> NDArray[np.float64]:
+    """A point (3,) of the camera frame in the pelvis heading frame, metres."""
+    pose = np.asarray(camera.camera_in_pelvis, dtype=np.float64)
+    return pose[:3, :3] @ np.asarray(point_in_camera, dtype=np.float64) + pose[:3, 3]
+
+
+def floor_m(key_bodies: NDArray[np.floating]) -> float:
+    """Height in the pelvis heading frame of the floor, on which the lowest key body stands, metres."""
+    return float(_check(key_bodies)[:, 2].min())
+
+
 def project(camera: Camera, point_in_pelvis: NDArray[np.floating]) -> tuple[float, float]:
     """Pixel (x, y) of a point (3,) of the pelvis heading frame; points behind the camera fall far outside the image."""
-    pose = np.asarray(camera.camera_in_pelvis, dtype=np.float64)
-    in_camera = pose[:3, :3].T @ (np.asarray(point_in_pelvis, dtype=np.float64) - pose[:3, 3])
+    in_camera = to_camera(camera, point_in_pelvis)
     depth = max(float(in_camera[2]), NEAR_M)
     x, y, w = np.asarray(camera.intrinsics, dtype=np.float64) @ np.array([in_camera[0], in_camera[1], depth])
     return float(x / w), float(y / w)
@@ -81,11 +97,11 @@ def stance(camera: Camera, key_bodies: NDArray[np.floating]) -> NDArray[np.float
     """How a camera stands, (3, 4): where its rays go, and where it is above the floor.
 
     The first three columns turn homogeneous pixels (x, y, 1) into directions in the pelvis heading frame. The last is the
-    camera's position in that frame, but for z its height above the robot's lowest key body, which stands on the floor, metres.
+    camera's position in that frame, but for z its height above the floor, metres.
     """
     pose = np.asarray(camera.camera_in_pelvis, dtype=np.float64)
     rays = pose[:3, :3] @ np.linalg.inv(np.asarray(camera.intrinsics, dtype=np.float64))
-    place = pose[:3, 3] - [0.0, 0.0, _check(key_bodies)[:, 2].min()]
+    place = pose[:3, 3] - [0.0, 0.0, floor_m(key_bodies)]
     return np.concatenate([rays, place[:, None]], axis=1)
 
 

@@ -31,6 +31,8 @@ from torch.nn import functional
 from proprio_mllm.model.batch import Movable
 from proprio_mllm.model.cse import SHARP
 from proprio_mllm.model.point_map import GeoFeatures, Named, confident_loss, pixels, points_and_confidence
+from proprio_mllm.model.word_tokens import Tokens
+from proprio_mllm.model.wording import Words
 
 #: Rows and columns of pixels of a cell.
 STRIDE: Final = 8
@@ -154,6 +156,12 @@ def _rays(stance: Tensor, size: Sequence[int]) -> Tensor:
     rays = functional.normalize(rays, dim=1)
     heights = _HEIGHTS * (stance[:, 2, 3] - _STANDING_M)
     return torch.cat([rays, heights[:, None, None, None].expand(-1, 1, *rays.shape[2:])], dim=1)
+
+
+def name_rows(tokens: Tokens, table: Tensor, names: Sequence[Words]) -> Tensor:
+    """Unit rows (C, D) of names in the language model's table (V, D), means over their words: what keys are like."""
+    rows = torch.stack([table[tokens.tokens(name)].float().mean(0) for name in names])
+    return functional.normalize(rows, dim=-1)
 
 
 def centres_of(named: Named, names: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:

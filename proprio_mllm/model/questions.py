@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from interface.bodies import KEY_BODIES
 from interface.steps import Action
-from proprio_mllm.model.geometry import arm_length_m
+from proprio_mllm.model.geometry import arm_length_m, floor_m
 from proprio_mllm.model.prompts import Style
 from proprio_mllm.model.wording import id_words, place_words
 
@@ -136,7 +136,7 @@ def shift_answer(center: NDArray[np.floating], key_bodies: NDArray[np.floating])
 
 def place_answer(center: NDArray[np.floating], key_bodies: NDArray[np.floating]) -> str:
     """`place_words` without the word that opens them, in the tokens of episodes (`spoken`)."""
-    words = place_words(center, float(np.asarray(key_bodies)[:, 2].min()))
+    words = place_words(center, floor_m(key_bodies))
     return "".join(f" {word} " for word in words[1:]).rstrip()
 
 

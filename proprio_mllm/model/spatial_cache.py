@@ -45,7 +45,7 @@ class SpatialCache:
         if missing:
             pick = torch.tensor(missing, device=images.rgb.device)
             points, pose = (None if one is None else one[pick] for one in (images.points_m, images.camera_in_pelvis))
-            made = cse.spatial(encoder(images.rgb[pick], points, None), *images.grid, pose).half()
+            made = cse.spatial(encoder(images.rgb[pick], points), *images.grid, pose).half()
             fresh = dict(zip(missing, made, strict=True))
             for index, one in fresh.items():
                 write_cached(names[index], {"spatial": one.cpu().numpy()})

@@ -91,7 +91,7 @@ class _Base(Objective):
         return module(batch)
 
     def _view_batch(self, rng: np.random.Generator, size: int, questions: int) -> _JointBatch:
-        rows = [self._views.row(i) for i in rng.choice(self._views.split.train, size)]
+        rows = self._views.draw(rng, size)
         segmentation = torch.from_numpy(np.stack([row.segmentation for row in rows]))
         grid = segmentation.shape[1] // CELL, segmentation.shape[2] // CELL
         shares = shown_shares(segmentation, grid, len(self._views.type_names))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from proprio_mllm.model.batch import Movable
-from proprio_mllm.model.geometry import stance
+from proprio_mllm.model.geometry import stance, to_camera
 from proprio_mllm.model.named_map import NamedPointMap, NamedTruth, centres_of, named_map_loss, named_truth
 from proprio_mllm.model.point_map import FAR_M, GeoFeatures, point_map_loss, read_at_centres
 from proprio_mllm.training.loop import Objective
@@ -32,7 +32,8 @@ class PointMapObjective(Objective):
 
     def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> tuple[Tensor, Tensor]:
         """Images (I, 3, H, W) and true points (I, H, W, 3)."""
-        return _stack([self._views.row(int(i)) for i in rng.choice(self._views.split.train, size)])
+        rows = self._views.draw(rng, size)
+        return _pictures(rows), _points(rows)
 
     def loss(
         self, module: nn.Module, batch: tuple[Tensor, Tensor], generator: torch.Generator
@@ -62,7 +63,7 @@ class NamedMapObjective(Objective):
 
     def batch(self, rng: np.random.Generator, size: int, kind: None = None) -> NamedBatch:
         """Views with what is where."""
-        return named_batch(self._views, [self._views.row(int(i)) for i in rng.choice(self._views.split.train, size)])
+        return named_batch(self._views, self._views.draw(rng, size))
 
     def loss(self, module: nn.Module, batch: NamedBatch, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
         """`named_map_loss`; nothing is drawn."""
@@ -87,25 +88,27 @@ def named_batch(views: Views, rows: Sequence[ViewRow]) -> NamedBatch:
     for row in rows:
         camera, bodies = row.view.camera, row.view.key_bodies
         assert camera is not None and bodies is not None
-        pose = np.asarray(camera.camera_in_pelvis, dtype=np.float64)
         things = sorted(row.objects, key=lambda one: -int(one["pixels"]))  # a small one stands before a large one
         centres = [
             (
                 views.type_names.index(str(one["id"]).rpartition("_")[0]),
                 tuple(int(edge) for edge in one["bbox"]),
-                pose[:3, :3].T @ (np.asarray(one["center_in_pelvis"], dtype=np.float64) - pose[:3, 3]),
+                to_camera(camera, np.asarray(one["center_in_pelvis"])),
             )
             for one in things
         ]
         fields.append(named_truth(row.points_m, row.segmentation, centres))
         stances.append(stance(camera, bodies))
     truth = NamedTruth(*(torch.from_numpy(np.stack(one)) for one in zip(*fields, strict=True)))
-    return NamedBatch(_stack(rows)[0], torch.from_numpy(np.stack(stances)).float(), truth)
+    return NamedBatch(_pictures(rows), torch.from_numpy(np.stack(stances)).float(), truth)
 
 
-def _stack(rows: Sequence[ViewRow]) -> tuple[Tensor, Tensor]:
-    rgb = torch.from_numpy(np.stack([row.view.image for row in rows])).permute(0, 3, 1, 2).contiguous()
-    return rgb, torch.from_numpy(np.stack([row.points_m for row in rows]))
+def _pictures(rows: Sequence[ViewRow]) -> Tensor:
+    return torch.from_numpy(np.stack([row.view.image for row in rows])).permute(0, 3, 1, 2).contiguous()
+
+
+def _points(rows: Sequence[ViewRow]) -> Tensor:
+    return torch.from_numpy(np.stack([row.points_m for row in rows]))
 
 
 @torch.no_grad()
@@ -123,16 +126,15 @@ def point_map_error(
     chosen = views.split.test[:limit]
     for start in range(0, len(chosen), 32):
         rows = [views.row(int(i)) for i in chosen[start : start + 32]]
-        rgb, points = _stack(rows)
         if isinstance(encoder, NamedPointMap):
             assert names is not None
             batch = named_batch(views, rows)
-            geo = encoder(rgb.to(device), None, batch.stance.to(device))
+            geo = encoder(batch.rgb.to(device), None, batch.stance.to(device))
             found += _looked_up(encoder, geo, batch.truth, names, near_m)
         else:
-            geo = encoder(rgb.to(device))
+            geo = encoder(_pictures(rows).to(device))
         predicted = geo.points_m.cpu()  # (I, h, w, 3)
-        truth = read_at_centres(points, predicted.shape)
+        truth = read_at_centres(_points(rows), predicted.shape)
         valid = torch.isfinite(truth).all(-1) & (truth.norm(dim=-1) < FAR_M)
         distance = (predicted - truth).norm(dim=-1)[valid]
         errors.append(distance)

@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-import numpy as np
 import torch
-from torch.nn import functional
 
 from proprio_mllm.model.batch import Collator
+from proprio_mllm.model.geometry import floor_m, to_pelvis
 from proprio_mllm.model.modeling import ProprioMLLM
-from proprio_mllm.model.named_map import NamedPointMap, centres_of
+from proprio_mllm.model.named_map import NamedPointMap, centres_of, name_rows
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import Words, id_words, place_words
 from proprio_mllm.training.sources import Demos
@@ -55,17 +54,16 @@ class Places:
                 continue
             views = [self._demos.view(row) for _, row, _ in some]
             images = self._collator.images(views)
-            names = [self._table[self._tokens.tokens(thing[:-1])].float().mean(0) for *_, thing in some]
+            names = name_rows(self._tokens, self._table, [thing[:-1] for *_, thing in some])
             geo = self._encoder(images.rgb, None, images.stance)
             assert geo.named is not None
             scale = self._encoder.scale.exp()
-            centres, cosine = centres_of(geo.named, functional.normalize(torch.stack(names), dim=-1), scale)
+            centres, cosine = centres_of(geo.named, names, scale)
             sure = scale * cosine.amax(1) + self._encoder.bias > _FOUND
-            for (row, *_), view, centre, known in zip(some, views, centres.double().numpy(), sure.tolist(), strict=True):
+            for (row, *_), view, centre, known in zip(some, views, centres.numpy(), sure.tolist(), strict=True):
                 if known:
                     assert view.camera is not None and view.key_bodies is not None
-                    pose = np.asarray(view.camera.camera_in_pelvis, dtype=np.float64)
-                    found[row] = place_words(pose[:3, :3] @ centre + pose[:3, 3], float(view.key_bodies[:, 2].min()))
+                    found[row] = place_words(to_pelvis(view.camera, centre), floor_m(view.key_bodies))
         return found
 
 

@@ -135,6 +135,10 @@ class Views:
         objects = tuple(json.loads(row["objects"]))
         return ViewRow(view, motion, objects, decode_segmentation(row["segmentation"], height, width), points)
 
+    def draw(self, rng: np.random.Generator, size: int) -> list[ViewRow]:
+        """Training rows."""
+        return [self.row(int(index)) for index in rng.choice(self.split.train, size)]
+
     def asked(self, row: ViewRow, kinds: Sequence[str], count: int, rng: np.random.Generator) -> list[Asked]:
         """Questions about visible objects, at most `count`, one about each: a second would be answered by the first."""
         bodies = row.view.key_bodies

@@ -9,13 +9,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from interface.actions import ACTIONS
 from proprio_mllm.model.building import TRAINED_HERE, build_point_map, load_model
-from proprio_mllm.model.dense import DenseHead
 from proprio_mllm.model.modeling import ProprioMLLM
-from proprio_mllm.model.named_map import NamedPointMap
+from proprio_mllm.model.named_map import NamedPointMap, name_rows
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import ID_NUMBERS, MARKERS, name_words
 from proprio_mllm.training.geometry_stage import NamedMapObjective, PointMapObjective, point_map_error
@@ -60,5 +58,4 @@ def names_of(model: ProprioMLLM, types: Sequence[str]) -> Tensor:
     tokens, names = tokens_of(model.processor.tokenizer), [name_words(name) for name in types]
     parts = {part for name in names for part in name}
     others = [(word,) for word in (*MARKERS, *ACTIONS, *ID_NUMBERS) if word not in parts]
-    rows = DenseHead([tokens.tokens(name) for name in (*names, *others)]).names(model.table)
-    return functional.normalize(rows.float(), dim=-1)
+    return name_rows(tokens, model.table, [*names, *others])
