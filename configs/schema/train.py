@@ -306,6 +306,10 @@ class TrainConfig:
             self.model.weights is None or self.model.point_map.encoder != "named",
             "point_map.encoder 'named' learns the words of stage practice, which model.weights leave out; allowed: sim, cut3r",
         )
+        require(
+            not self.model.places or self.model.point_map.encoder == "named",
+            f"model.places is learnt from point_map.encoder 'named', not {self.model.point_map.encoder!r}",
+        )
         require(not self.shard or self.model.weights is not None, "shard=true shares a frozen backbone; set model.weights")
         require(not (self.shard and self.model.four_bit), "shard=true cannot share layers of 4 bits: leave out one of the two")
         require(self.micro_batches >= 1, f"micro_batches {self.micro_batches} must be at least 1")

@@ -16,6 +16,7 @@ from proprio_mllm.model.chat import IMAGE, Message
 from proprio_mllm.model.geometry import stance
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.named_map import NamedPointMap, NamedTruth, _rays, centres_of, named_map_loss, named_truth
+from proprio_mllm.model.point_map import Named
 from proprio_mllm.model.word_tokens import add_word_tokens, tokens_of
 from tests.model.conftest import TEXTS, TYPES, make_view, small
 
@@ -137,6 +138,26 @@ def test_words_look_into_the_point_map(model: ProprioMLLM) -> None:
         conf = [one[0, 1, 2].log()[None] for one in (geo.named.conf, geo.conf)]
         held = torch.cat([centre / 2, conf[0], point / 2, conf[1]])
         torch.testing.assert_close(given, named.put(held), atol=1e-4, rtol=1e-4)
+
+
+def test_words_score_as_the_keys_were_trained(model: ProprioMLLM) -> None:
+    point_map = model.point_map
+    with torch.no_grad():
+        point_map.scale.fill_(2.5)
+        point_map.bias.fill_(-3.0)
+    again = ProprioMLLM(model.vlm, model.cfg, model.processor, model.motion_ids, point_map)
+    assert (float(again.cse.named.scale), float(again.cse.named.bias)) == (2.5, -3.0)
+    again.keep_spatial()
+    assert again.seen is None  # what words look into is more than is kept
+
+
+def test_many_cells_unlike_a_name_do_not_outweigh_the_few_that_are_like_it() -> None:
+    keys, centres = torch.zeros(1, 20, 20, 4), torch.full((1, 20, 20, 3), 9.0)
+    keys[..., 0] = 1.0
+    keys[0, 3, 4], centres[0, 3, 4] = torch.tensor([0.0, 1.0, 0.0, 0.0]), torch.tensor([1.0, 2.0, 3.0])
+    place, cosine = centres_of(Named(keys, centres, torch.ones(1, 20, 20)), keys[:, 3, 4], torch.tensor(6.0))
+    assert int(cosine.argmax()) == 64
+    torch.testing.assert_close(place[0], centres[0, 3, 4], atol=0.05, rtol=0.05)
 
 
 def test_it_is_stored_with_the_heads(model: ProprioMLLM, tmp_path) -> None:

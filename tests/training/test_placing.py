@@ -17,7 +17,7 @@ from proprio_mllm.model.point_map import GeoFeatures, Named
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import id_words, place_words
 from proprio_mllm.training.pipeline import Pipeline
-from proprio_mllm.training.placing import Places, thing_of
+from proprio_mllm.training.placing import Places, _alone, thing_of
 from proprio_mllm.training.sources import Views
 from proprio_mllm.training.stages.inputs import lessons_of, point_map_of, turns_of
 
@@ -50,6 +50,13 @@ class Finder(NamedPointMap):
 )
 def test_what_an_answer_is_about(answer: str, thing: str) -> None:
     assert " ".join(thing_of(tuple(answer.split()))) == thing
+
+
+@pytest.mark.parametrize(
+    ("visible", "alone"), [("Mug_1 Pan_1", True), ("Mug_1 Mug_2", False), ("Mug_2", False), ("Pan_1", False)]
+)
+def test_what_stands_alone_of_its_name(visible: str, alone: bool) -> None:
+    assert _alone(("mug", "_1"), visible.split()) is alone
 
 
 def test_only_what_is_seen_alone_has_a_place(trained: Pipeline) -> None:
@@ -90,6 +97,12 @@ def test_answers_say_where_their_thing_is(trained: Pipeline, monkeypatch: pytest
         else:
             assert learnt == words.tokens(answers[row])
     assert changed > 0
+
+
+def test_places_need_a_point_map_that_knows_names(trained: Pipeline) -> None:
+    sim = dataclasses.replace(trained.cfg.model.point_map, encoder="sim")
+    with pytest.raises(ValueError, match=r"model\.places is learnt from .* not 'sim'"):
+        dataclasses.replace(trained.cfg, model=dataclasses.replace(trained.cfg.model, places=True, point_map=sim))
 
 
 def test_views_are_asked_for_places_too(trained: Pipeline) -> None:

@@ -47,7 +47,7 @@ def turns_of(pipeline: Pipeline, model: ProprioMLLM, demos: Demos, tokens: Motio
 
 
 def point_map_of(pipeline: Pipeline, cfg: ModelConfig) -> nn.Module | None:
-    """The trained point map, frozen."""
+    """The point map as its stage left it, or as it comes trained."""
     encoder = seeded(lambda: build_point_map(cfg), pipeline.cfg.seed)
     if encoder is not None and cfg.point_map.encoder in TRAINED_HERE:
         encoder.load_state_dict(read_tensors(pipeline.paths.stage("pointmap") / "checkpoint" / "model.safetensors"))
