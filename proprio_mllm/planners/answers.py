@@ -6,7 +6,7 @@ Paper: none; its planners are free to answer anything. Constrained, every reply 
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Final
 
 from interface.actions import ACTIONS, ActionKind, ActionSpec, Amount, exclude_each_other
@@ -14,7 +14,7 @@ from interface.belief import Belief
 from interface.bodies import Arm
 from interface.effects import Condition, Grasp, Walk
 from interface.steps import Action
-from proprio_mllm.model.wording import CAUSES, CHANGES, END, PLACES, id_words, number_words
+from proprio_mllm.model.wording import CAUSES, CHANGES, END, PLACES, Words, id_words, number_words
 from proprio_mllm.planners.furniture import CONTAINERS, FIXTURES, SEATS, SURFACES
 from proprio_mllm.planners.scripted.words import type_of
 
@@ -34,11 +34,19 @@ class AnswerGrammar:
             out none.
         reflects: whether an answer begins with a reflection.
         places: whether it may say where its thing is.
+        place: tells where that is, so that it is said whenever it is told; None leaves it to who answers.
     """
 
-    def __init__(self, ids: Sequence[str], belief: Belief | None = None, reflects: bool = False, places: bool = False) -> None:
-        self.ids: Mapping[tuple[str, ...], str] = {id_words(name): name for name in ids}
-        self._belief, self._reflection, self._places = belief, _REFLECTION if reflects else (), places
+    def __init__(
+        self,
+        ids: Sequence[str],
+        belief: Belief | None = None,
+        reflects: bool = False,
+        places: bool = False,
+        place: Callable[[Words], Words] | None = None,
+    ) -> None:
+        self.ids: Mapping[Words, str] = {id_words(name): name for name in ids}
+        self._belief, self._reflection, self._places, self._place = belief, _REFLECTION if reflects else (), places, place
         #: Words of the reflection.
         self.reflected = len(self._reflection)
         spots = [name for name in ids if type_of(name) in (*SURFACES, *SEATS, *CONTAINERS)]
@@ -55,12 +63,8 @@ class AnswerGrammar:
             spec = ACTIONS[words[0]]
             if not spec.takes_object or words[-1] == "unseen":
                 return ["do"]
-            if PLACES[0][0] in words:
-                said = len(words) - words.index(PLACES[0][0])  # type: ignore[attr-defined]  # every sequence has index
-                return list(PLACES[said]) if said < len(PLACES) else ["do"]
             following = _next(words[1:], (one for one, name in self.ids.items() if self._may_be_wanted(spec, name)))
-            after = [*PLACES[0], "do"] if self._places else ["do"]
-            return [*following, "unseen"] if len(words) == 1 else following or after
+            return [*following, "unseen"] if len(words) == 1 else following or self._of_place(tuple(words[1:]))
         skipped = self._searched if words[1] == "unseen" else frozenset()
         step = list(words[words.index("do") + 1 :])  # type: ignore[attr-defined]  # every sequence has index
         if step and step[-1] == END:
@@ -69,6 +73,14 @@ class AnswerGrammar:
             cut = step.index("&")
             return self._of_action(step[cut + 1 :], self._action(step[:cut]), skipped)
         return self._of_action(step, None, skipped)
+
+    def _of_place(self, words: Words) -> list[str]:
+        """What follows the thing of a sub-goal and the first words of its place."""
+        end = next(index for index, word in enumerate(words) if word.startswith("_")) + 1
+        said, open_end = len(words) - end, self._place is None and len(words) == end
+        told = PLACES if self._place is None else tuple((word,) for word in self._place(words[:end]))
+        following = told[said] if self._places and said < len(told) else ()
+        return [*following, *(("do",) if open_end or not following else ())]
 
     def _of_action(self, words: Sequence[str], first: Action | None, skipped: Collection[str]) -> list[str]:
         if not words:

@@ -14,6 +14,7 @@ lessons are so. The log, in which failed steps stand with their codes, is the sa
 
 from __future__ import annotations
 
+import functools
 import logging
 import time
 from collections.abc import Sequence
@@ -38,7 +39,9 @@ from proprio_mllm.model.building import load_model, load_motion, merge_adapter
 from proprio_mllm.model.chat import Encoded
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.observing import EpisodeLog, turn_example
+from proprio_mllm.model.named_map import NamedPointMap
+from proprio_mllm.model.observing import EpisodeLog, turn_example, view_of
+from proprio_mllm.model.placing import Placing, stands_alone
 from proprio_mllm.model.word_tokens import WordTokens, tokens_of
 from proprio_mllm.model.wording import Words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
@@ -119,6 +122,8 @@ class WordsPlanner:
         self.image_size = model.cfg.image_size if model.cfg.sees else 0
         self._tokenizer = model.processor.tokenizer
         self._collator = Collator(model.processor, model.cfg)
+        knows = model.point_map if model.cfg.places else None
+        self._placing = Placing(model, knows) if isinstance(knows, NamedPointMap) else None
         self._state: WordsState | None = None
         self._pad = int(self._tokenizer.pad_token_id)
 
@@ -192,7 +197,13 @@ class WordsPlanner:
         belief = state.sightings.belief
         reflects = state.reflects and belief.failed is not None
         known, places = observation.known_objects, self.model.cfg.places
-        return _Answer(AnswerGrammar(known, None if self.insist else belief, reflects, places), state, turn)
+        place = None if seen is None or self._placing is None else functools.cache(functools.partial(self._place, seen))
+        return _Answer(AnswerGrammar(known, None if self.insist else belief, reflects, places, place), state, turn)
+
+    def _place(self, observation: Observation, thing: Words) -> Words:
+        """Where a thing is by the point map, in words; none where it is not seen, or not alone of its name."""
+        assert self._placing is not None
+        return self._placing([view_of(observation)], [thing])[0] if stands_alone(thing, observation.visible_objects) else ()
 
     def _write(self, answers: Sequence[_Answer]) -> None:
         """Continues every answer to its end; what has been read of a log before is not read again for an answer alone."""

@@ -9,7 +9,7 @@ from interface.actions import ACTIONS
 from interface.belief import Belief
 from interface.observation import HistoryItem
 from interface.steps import PlanStep
-from proprio_mllm.model.wording import END, PLACES, answer_words, place_words, read_step
+from proprio_mllm.model.wording import END, PLACES, Words, answer_words, place_words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
 
 IDS = ("DiningTable_1", "DiningTable_2", "Mug_1", "TVStand_1", "Fridge_1", "Zubo_1")
@@ -58,6 +58,17 @@ def test_a_place_stands_before_the_step_where_it_may_be_said() -> None:
     assert "at" not in places.allowed(("Pick", "unseen"))
     assert places.allowed(words[:6]) == list(PLACES[3]) and places.allowed(words[:7]) == ["do"]
     assert read_step(words, places.ids) == step
+
+
+def test_a_place_that_is_told_is_said() -> None:
+    step, place = PlanStep.parse("MoveDown(0.2)"), ("at", "20d", "0.60", "0.90")
+    asked: list[Words] = []
+    told = AnswerGrammar(IDS, places=True, place=lambda thing: asked.append(thing) or (place if thing[0] == "mug" else ()))
+    words = answer_words("Pick", "Mug_1", step, place=place)
+    assert said(words, told) and set(asked) == {("mug", "_1")}
+    assert [told.allowed(words[:size]) for size in range(3, 8)] == [["at"], ["20d"], ["0.60"], ["0.90"], ["do"]]
+    assert told.allowed(("Pick", "zubo", "_1")) == ["do"]
+    assert said(answer_words("Pick", None, step), told) and said(answer_words("Done", "", PlanStep.parse("Done()")), told)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,8 @@ from proprio_mllm.evaluation.lessons import Lessons, WordsOnly
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import build_model, build_processor, save_model
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.observing import turn_example
+from proprio_mllm.model.observing import turn_example, view_of
+from proprio_mllm.model.placing import Placing, stands_alone
 from proprio_mllm.model.word_tokens import add_word_tokens
 from proprio_mllm.model.wording import CAUSES, CHANGES, answer_words
 from proprio_mllm.planners.answers import AnswerGrammar
@@ -176,6 +177,30 @@ def test_token_after_token_is_read_as_all_at_once(seeing: WordsPlanner) -> None:
         torch.testing.assert_close(model.following(batch, cache), whole, atol=1e-5, rtol=1e-4)
         if count < 3:
             batch = batch.then(torch.tensor([[answer[count]] for answer in words]))
+
+
+def test_the_point_map_says_where_things_are(seeing: WordsPlanner, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = seeing.model
+    plain = model.cfg
+    model.cfg = dataclasses.replace(plain, places=True)
+    placed, place = WordsPlanner(model, seeing.motion, temperature=3.0), Placing(model, model.point_map)
+
+    def goals(found: float) -> list[tuple[str, ...]]:
+        monkeypatch.setattr("proprio_mllm.model.placing._FOUND", found)
+        answers = [placed._answer(seen(WordsOnly(seed).shown(), seed), begin(placed, seed)) for seed in range(12)]
+        placed._write(answers)
+        return [tuple(one.words[: one.words.index("do")]) for one in answers]
+
+    counts = [0, 0]
+    for seed, goal in enumerate(goals(-1e9)):
+        shown = seen(WordsOnly(seed).shown(), seed)
+        at = goal.index("at") if "at" in goal else len(goal)
+        there = stands_alone(goal[1:at], shown.visible_objects)
+        assert goal[at:] == (place([view_of(shown)], [goal[1:at]])[0] if there else ())
+        counts[there] += 1
+    assert min(counts) > 0, counts
+    assert not any("at" in goal for goal in goals(1e9))  # nothing is found
+    model.cfg = plain
 
 
 def test_what_has_been_read_is_not_read_again(planner: WordsPlanner) -> None:

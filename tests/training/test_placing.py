@@ -13,11 +13,12 @@ from torch.nn import functional
 from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.building import load_model
 from proprio_mllm.model.named_map import NamedPointMap
+from proprio_mllm.model.placing import stands_alone
 from proprio_mllm.model.point_map import GeoFeatures, Named
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import id_words, place_words
 from proprio_mllm.training.pipeline import Pipeline
-from proprio_mllm.training.placing import Places, _alone, thing_of
+from proprio_mllm.training.placing import Places, thing_of
 from proprio_mllm.training.sources import Views
 from proprio_mllm.training.stages.inputs import lessons_of, point_map_of, turns_of
 
@@ -53,10 +54,10 @@ def test_what_an_answer_is_about(answer: str, thing: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("visible", "alone"), [("Mug_1 Pan_1", True), ("Mug_1 Mug_2", False), ("Mug_2", False), ("Pan_1", False)]
+    ("visible", "expected"), [("Mug_1 Pan_1", True), ("Mug_1 Mug_2", False), ("Mug_2", False), ("Pan_1", False)]
 )
-def test_what_stands_alone_of_its_name(visible: str, alone: bool) -> None:
-    assert _alone(("mug", "_1"), visible.split()) is alone
+def test_what_stands_alone_of_its_name(visible: str, expected: bool) -> None:
+    assert stands_alone(("mug", "_1"), visible.split()) is expected
 
 
 def test_only_what_is_seen_alone_has_a_place(trained: Pipeline) -> None:
@@ -75,7 +76,7 @@ def test_only_what_is_seen_alone_has_a_place(trained: Pipeline) -> None:
 
 
 def test_answers_say_where_their_thing_is(trained: Pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("proprio_mllm.training.placing._FOUND", -1e9)
+    monkeypatch.setattr("proprio_mllm.model.placing._FOUND", -1e9)
     model = load_model(trained.paths.model("base"))
     model.cfg = dataclasses.replace(model.cfg, places=True)
     demos, words = lessons_of(trained, model.cfg), tokens_of(model.processor.tokenizer)
