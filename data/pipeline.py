@@ -12,9 +12,8 @@ import dataclasses
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import as_completed
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,7 +29,7 @@ from data.motion import FPS
 from data.retarget import Retargeter
 from data.shards import Manifest, ShardWriter, config_hash
 from data.sources import clip_ids, read_clip
-from data.workers import worker_pool
+from data.workers import computed
 from interface.motion import Motion
 from robots.spec import load_robot
 
@@ -220,14 +219,8 @@ def _computed(
     if cfg.scheduler == "ray":
         yield from _on_ray(cfg, folder, parts, missing, replay)
         return
-    if cfg.workers == 1 or len(missing) < 2:
-        for index in missing:
-            yield index, part_of_clips(cfg, folder, parts[index], replay)
-        return
-    with worker_pool(min(cfg.workers, len(missing))) as pool:
-        futures = {pool.submit(part_of_clips, cfg, folder, parts[index], replay): index for index in missing}
-        for future in as_completed(futures):
-            yield futures.pop(future), future.result()
+    calls = {index: partial(part_of_clips, cfg, folder, parts[index], replay) for index in missing}
+    yield from computed(calls, cfg.workers)
 
 
 def _on_ray(

@@ -11,13 +11,11 @@ pretrained backbone reads feedback in plain words already.
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import dataclasses
 import functools
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,7 +24,7 @@ from tqdm import tqdm
 
 from configs.schema.collect import CollectConfig
 from data.shards import Manifest, ShardWriter, config_hash
-from data.workers import worker_pool
+from data.workers import computed
 from interface.actions import ACTIONS, ActionKind
 from interface.bodies import PAPER_ROBOTS, Arm
 from interface.observation import HistoryItem, Observation
@@ -93,7 +91,8 @@ def _write(
     total = -(-config.count // config.part_size)
     missing = writer.missing(total)
     progress(total - len(missing), total)
-    for done, (part, rows) in enumerate(_computed(job, missing, config.workers), total - len(missing) + 1):
+    calls = {part: functools.partial(job, part) for part in missing}
+    for done, (part, rows) in enumerate(computed(calls, config.workers), total - len(missing) + 1):
         writer.write(part, rows)
         progress(done, total)
     return writer.finish({**about, "physics": PHYSICS})
@@ -104,7 +103,16 @@ def _lessons(config: CollectConfig, part: int, student: str | None = None) -> li
     os.environ.setdefault("MUJOCO_GL", "egl")
     from sim.collection.demonstrations import lessons_of_part
 
-    return list(lessons_of_part(config, part, Rules(), None if student is None else _in_words(student)))
+    if student is None:
+        return list(lessons_of_part(config, part, Rules()))
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # as in a worker process: their number decides the order of sums, and training has its own
+    try:
+        return list(lessons_of_part(config, part, Rules(), _in_words(student)))
+    finally:
+        torch.set_num_threads(threads)
 
 
 class Rules:
@@ -144,32 +152,3 @@ def _in_words(model: str) -> Callable[[Observation], PlanStep | None]:
 
 def _task(observation: Observation) -> TaskInfo:
     return TaskInfo(observation.instruction, observation.robot, observation.time_limit)
-
-
-def _computed(
-    job: Callable[[int], list[dict[str, Any]]], missing: Sequence[int], workers: int
-) -> Iterator[tuple[int, list[dict[str, Any]]]]:
-    """Parts as they are finished."""
-    if workers == 1 or len(missing) < 2:
-        for part in missing:
-            with _one_thread():
-                rows = job(part)
-            yield part, rows
-        return
-    with worker_pool(min(workers, len(missing))) as pool:
-        futures = {pool.submit(job, part): part for part in missing}
-        for future in as_completed(futures):
-            yield futures.pop(future), future.result()
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """One torch thread, as in a worker process: the number of threads decides the order of sums, and training has its own."""
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

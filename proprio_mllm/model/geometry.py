@@ -46,6 +46,11 @@ def arm_length_m(key_bodies: NDArray[np.floating]) -> float:
     return float(np.mean(lengths))
 
 
+def shoulders(key_bodies: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The left and the right shoulder (2, 3) of (K, 3) key bodies."""
+    return _check(key_bodies)[[_INDEX["left_shoulder"], _INDEX["right_shoulder"]]]
+
+
 def body_point_in_pelvis(key_bodies: NDArray[np.floating], provider: CentroidName) -> NDArray[np.float64]:
     """The body point (3,) that stands for the robot, metres, pelvis heading frame.
 

@@ -36,6 +36,8 @@ from proprio_mllm.model.wording import Words
 
 #: Rows and columns of pixels of a cell.
 STRIDE: Final = 8
+#: A cell's weight falls with this power of its thing's size in the picture; sizes of fewer pixels count as so many.
+_SIZES, _SMALL = 0.75, 32
 #: Heights of a camera above the floor are told from this, metres, and by this factor.
 _STANDING_M, _HEIGHTS = 1.0, 2.0
 _STEM, _QUARTER, _EIGHTH = 24, 48, 128
@@ -185,7 +187,7 @@ class NamedTruth(Movable):
         points_m: (I, h, w, 3) camera frame, of the surface.
         centres_m: (I, h, w, 3) camera frame, of the thing; NaN where none is shown.
         types: (I, h, w) integer type, -1 for none.
-        weights: (I, h, w) one over the root of the thing's size in the picture: of a small one there are few cells.
+        weights: (I, h, w) less for a thing that is larger in the picture: of a small one there are few cells.
     """
 
     points_m: Tensor
@@ -228,7 +230,7 @@ def named_truth(
         picked(points_m).astype(np.float32),
         table[whose + 1],
         picked(segmentation).astype(np.int64),
-        (STRIDE / np.sqrt(picked(sizes))).astype(np.float32),
+        (STRIDE**2 / np.maximum(picked(sizes), _SMALL)).astype(np.float32) ** _SIZES,
     )
 
 

@@ -1,6 +1,6 @@
 """Where named things are in pictures, in words: what `model.places` says in answers.
 
-A point map that knows what is where finds a thing by its name, and its place is written down as words like "at 20d 0.60 0.90":
+A point map that knows what is where finds a thing by its name, and its place is written down in words (`wording.place_words`):
 the labels of training, and with the point map in the model the words of its answers too, so that the step is decided behind
 the same words that it was learnt behind. A model without that point map says them itself.
 """
@@ -13,7 +13,7 @@ from typing import Final
 import torch
 
 from proprio_mllm.model.batch import Collator, View
-from proprio_mllm.model.geometry import floor_m, to_pelvis
+from proprio_mllm.model.geometry import to_pelvis
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.named_map import NamedPointMap, centres_of, name_rows
 from proprio_mllm.model.word_tokens import tokens_of
@@ -54,7 +54,7 @@ class Placing:
         found: list[Words] = []
         for view, centre, known in zip(views, centres.cpu().numpy(), sure.tolist(), strict=True):
             assert view.camera is not None and view.key_bodies is not None
-            found.append(place_words(to_pelvis(view.camera, centre), floor_m(view.key_bodies)) if known else ())
+            found.append(place_words(to_pelvis(view.camera, centre), view.key_bodies) if known else ())
         return found
 
 

@@ -16,9 +16,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from interface.bodies import KEY_BODIES
 from interface.steps import Action
-from proprio_mllm.model.geometry import arm_length_m, floor_m
+from proprio_mllm.model.geometry import arm_length_m, shoulders
 from proprio_mllm.model.prompts import Style
 from proprio_mllm.model.wording import id_words, place_words
 
@@ -103,12 +102,9 @@ def reach_answer(center: NDArray[np.floating], key_bodies: NDArray[np.floating])
         center: (3,) object.
         key_bodies: (K, 3) the robot's own bodies.
     """
-    bodies = np.asarray(key_bodies)
-    long_enough = [
-        side
-        for side in ("left", "right")
-        if np.linalg.norm(center - bodies[KEY_BODIES.index(f"{side}_shoulder")]) <= REACH * arm_length_m(key_bodies)
-    ]
+    most_m = REACH * arm_length_m(key_bodies)
+    sides = zip(("left", "right"), shoulders(key_bodies), strict=True)
+    long_enough = [side for side, shoulder in sides if np.linalg.norm(center - shoulder) <= most_m]
     return "both" if len(long_enough) == 2 else (long_enough or ["none"])[0]
 
 
@@ -121,8 +117,7 @@ def body_shift_m(center: NDArray[np.floating], key_bodies: NDArray[np.floating])
         center: (3,) object.
         key_bodies: (K, 3) the robot's own bodies.
     """
-    shoulders = [KEY_BODIES.index("left_shoulder"), KEY_BODIES.index("right_shoulder")]
-    level_m = float(np.asarray(key_bodies)[shoulders, 2].mean()) - WORKING * arm_length_m(key_bodies)
+    level_m = float(shoulders(key_bodies)[:, 2].mean()) - WORKING * arm_length_m(key_bodies)
     return round((float(center[2]) - level_m) / STEP_M) * STEP_M
 
 
@@ -136,7 +131,7 @@ def shift_answer(center: NDArray[np.floating], key_bodies: NDArray[np.floating])
 
 def place_answer(center: NDArray[np.floating], key_bodies: NDArray[np.floating]) -> str:
     """`place_words` without the word that opens them, in the tokens of episodes (`spoken`)."""
-    words = place_words(center, floor_m(key_bodies))
+    words = place_words(center, key_bodies)
     return "".join(f" {word} " for word in words[1:]).rstrip()
 
 

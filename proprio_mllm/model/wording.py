@@ -34,6 +34,7 @@ from interface.observation import HistoryItem
 from interface.sightings import Seen, Sightings
 from interface.steps import Action, PlanStep
 from interface.symbolic import Event, events_of
+from proprio_mllm.model.geometry import arm_length_m, floor_m, shoulders
 
 Words = tuple[str, ...]
 
@@ -123,16 +124,26 @@ def _degrees(value: float) -> str:
     return f"{min(max(round(value / 5.0), -36), 36) * 5}d"
 
 
-def place_words(center: NDArray[np.floating], floor_m: float) -> Words:
-    """Where a thing is: bearing, positive to the left, distance from the pelvis in the floor plane, and height above the floor.
+def place_words(center: NDArray[np.floating], key_bodies: NDArray[np.floating]) -> Words:
+    """Where a thing is, from the robot's own body.
+
+    Bearing, positive to the left, and distance from the pelvis in the floor plane; height above the floor; distance from the
+    left and from the right shoulder in arm lengths, and elevation as the shoulders see it.
 
     Args:
         center: (3,) pelvis heading frame, metres.
-        floor_m: height of the floor in that frame.
+        key_bodies: (K, 3) the robot's own bodies in that frame.
     """
-    x, y, z = (float(one) for one in center)
-    bearing = round(math.degrees(math.atan2(y, x)) / _PLACE_DEG) * _PLACE_DEG
-    return ("at", f"{bearing}d", _place_m(math.hypot(x, y)), _place_m(z - floor_m))
+    from_pelvis, arm_m = np.asarray(center, dtype=np.float64), arm_length_m(key_bodies)
+    from_shoulders = from_pelvis - shoulders(key_bodies)
+    reaches = np.linalg.norm(from_shoulders, axis=1) / arm_m
+    metres = (math.hypot(*from_pelvis[:2]), float(from_pelvis[2]) - floor_m(key_bodies), *map(float, reaches))
+    x, y, z = from_shoulders.mean(axis=0)
+    return ("at", _place_deg(*from_pelvis[:2]), *map(_place_m, metres), _place_deg(math.hypot(x, y), z))
+
+
+def _place_deg(x: float, y: float) -> str:
+    return f"{round(math.degrees(math.atan2(y, x)) / _PLACE_DEG) * _PLACE_DEG}d"
 
 
 def _place_m(value: float) -> str:
@@ -142,8 +153,9 @@ def _place_m(value: float) -> str:
 #: The words that a place may have, one after the other.
 PLACES: Final = (
     ("at",),
-    tuple(f"{angle}d" for angle in range(-180, 181, _PLACE_DEG)),
-    *[tuple(_place_m(step * _PLACE_M) for step in range(1, round(_PLACE_FAR_M / _PLACE_M) + 1))] * 2,
+    (_TURNS := tuple(f"{angle}d" for angle in range(-180, 181, _PLACE_DEG))),
+    *[tuple(_place_m(step * _PLACE_M) for step in range(1, round(_PLACE_FAR_M / _PLACE_M) + 1))] * 4,
+    _TURNS[len(_TURNS) // 4 : -(len(_TURNS) // 4)],
 )
 
 

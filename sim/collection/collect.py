@@ -13,8 +13,8 @@ from __future__ import annotations
 import dataclasses
 import logging
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from configs.arguments import command, read_arguments
 from configs.schema.collect import CollectConfig
 from data.shards import Manifest, ShardWriter, config_hash
-from data.workers import worker_pool
+from data.workers import computed
 
 _LOG = logging.getLogger(__name__)
 
 #: Raised when the meaning of a configuration changes, so that old shards are not continued.
-_VERSION = {"views": 3, "demos": 3}
+_VERSION = {"views": 4, "demos": 3}
 #: Fields that do not change what is written.
 _UNKEYED = {
     "views": ("out", "workers", "noise", "medium_share", "foreseen"),
@@ -72,7 +72,7 @@ def collect(config: CollectConfig, progress: Callable[[int, int], None] | None =
     done = total - len(missing)
     report = progress or (lambda finished, parts: _LOG.info("%s: %d of %d parts", config.out, finished, parts))
     report(done, total)
-    for part, rows in _computed(config, missing):
+    for part, rows in computed({part: partial(rows_of_part, config, part) for part in missing}, config.workers):
         writer.write(part, rows)
         done += 1
         report(done, total)
@@ -85,18 +85,6 @@ def _metadata(config: CollectConfig) -> dict[str, Any]:
     from sim.collection.view_sampling import type_names
 
     return {"type_names": list(type_names())}
-
-
-def _computed(config: CollectConfig, missing: Sequence[int]) -> Iterator[tuple[int, list[dict[str, Any]]]]:
-    """Parts as they are finished: in this process, or in spawned ones (the OpenGL context does not survive a fork)."""
-    if config.workers == 1 or len(missing) < 2:
-        for part in missing:
-            yield part, rows_of_part(config, part)
-        return
-    with worker_pool(min(config.workers, len(missing))) as pool:
-        futures = {pool.submit(rows_of_part, config, part): part for part in missing}
-        for future in as_completed(futures):
-            yield futures.pop(future), future.result()
 
 
 def _with_bar(run: Callable[[Callable[[int, int], None]], Manifest], title: str) -> Manifest:

@@ -1,4 +1,4 @@
-"""Worker processes end with the process that made them, at whatever moment it dies."""
+"""Worker processes end with the process that made them, at whatever moment it dies, and what they compute comes back."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
+
+from data.workers import computed
 
 SCRIPT = """
 import time
@@ -69,6 +72,20 @@ def test_workers_end_when_their_parent_is_killed(program: str, tmp_path: Path) -
     while _alive(worker) and time.monotonic() < deadline:
         time.sleep(0.2)
     assert not _alive(worker)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_calls_give_their_results_by_number(workers: int) -> None:
+    calls = {number: partial(pow, number, 2) for number in (3, 5, 8)}
+    assert dict(computed(calls, workers)) == {3: 9, 5: 25, 8: 64}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_after_a_failure_nothing_new_is_begun(workers: int, tmp_path: Path) -> None:
+    calls = {number: partial(subprocess.run, ["sh", "-c", f"sleep 0.2; touch {tmp_path}/{number}"]) for number in range(1, 30)}
+    with pytest.raises(ValueError, match="invalid literal"):
+        list(computed({0: partial(int, "none"), **calls}, workers))
+    assert len(list(tmp_path.iterdir())) < 10
 
 
 @pytest.mark.slow

@@ -58,7 +58,8 @@ def test_an_interrupted_run_continues_to_the_same_rows(
 
 def test_training_keeps_its_threads(request_: DaggerRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     threads, seen = torch.get_num_threads(), list[int]()
-    monkeypatch.setattr(dagger, "_lessons", lambda *job, **of: (seen.append(torch.get_num_threads()), [])[1])
+    lessons = "sim.collection.demonstrations.lessons_of_part"
+    monkeypatch.setattr(lessons, lambda *job: (seen.append(torch.get_num_threads()), [])[1])
     try:
         torch.set_num_threads(2)
         collect_dagger(request_, workers=1)

@@ -37,7 +37,10 @@ def test_a_cell_stands_for_the_smallest_thing_in_it() -> None:
     np.testing.assert_array_equal(centres[0, 1:], [first, table])
     np.testing.assert_array_equal(centres[1, 1:], [table, second])
     mugs, tables = (segmentation == 1).sum(), (segmentation == 0).sum()
-    np.testing.assert_allclose(weights[0], [0.0, 8 / mugs**0.5, 8 / tables**0.5], rtol=1e-6)
+    np.testing.assert_allclose(weights[0], [0.0, (64 / mugs) ** 0.75, (64 / tables) ** 0.75], rtol=1e-6)
+    segmentation[8:, 20:] = 0  # the first mug alone is very small
+    weights = named_truth(points, segmentation, things)[3]
+    np.testing.assert_allclose(weights[0, 1], 2**0.75, rtol=1e-6)
 
 
 def encoder(hidden: int = 16) -> NamedPointMap:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from interface.bodies import KEY_BODIES
 from interface.failures import FAILED
 from interface.observation import HistoryItem
 from interface.sightings import Shown, Sightings
@@ -130,19 +131,26 @@ def test_answers(verb: str, target: str | None, step: str, words: str) -> None:
 @pytest.mark.parametrize(
     ("center", "words"),
     [
-        ((0.6, 0.0, 0.3), "at 0d 0.60 0.90"),
-        ((0.3, -0.3, -0.58), "at -40d 0.40 0.10"),  # halves go to the even one
-        ((0.0, 5.0, 9.0), "at 90d 2.00 2.00"),
-        ((-1.0, -1e-9, -0.6), "at -180d 1.00 0.10"),
+        ((0.6, 0.0, 0.3), "at 0d 0.60 0.90 1.30 1.30 -10d"),
+        ((0.5, 0.2, 0.4), "at 20d 0.50 1.00 1.00 1.30 0d"),
+        ((0.0, -0.2, -0.1), "at -90d 0.20 0.50 1.30 1.00 -70d"),  # straight below the right shoulder
+        ((0.3, -0.3, -0.58), "at -40d 0.40 0.10 2.00 2.00 -70d"),  # halves go to the even one
+        ((0.0, 5.0, 9.0), "at 90d 2.00 2.00 2.00 2.00 60d"),
+        ((-1.0, -1e-9, -0.6), "at -180d 1.00 0.10 2.00 2.00 -40d"),
     ],
 )
 def test_places(center: tuple[float, float, float], words: str) -> None:
-    written = place_words(np.array(center), -0.6)
+    bodies = np.zeros((len(KEY_BODIES), 3))
+    for side, y in (("left", 0.2), ("right", -0.2)):  # arms of half a metre, stretched forward
+        for part, x in (("shoulder", 0.0), ("elbow", 0.25), ("hand", 0.5)):
+            bodies[KEY_BODIES.index(f"{side}_{part}")] = x, y, 0.4
+    bodies[KEY_BODIES.index("left_ankle"), 2] = -0.6
+    written = place_words(np.array(center), bodies)
     assert " ".join(written) == words
     assert all(word in may for word, may in zip(written, PLACES, strict=True))
     assert {word for may in PLACES[1:] for word in may} <= set(number_words())
     step = PlanStep.parse("MoveDown(0.2)")
-    assert answer_words("Pick", "Mug_1", step, ("body", "so", "height"), written)[:10] == (
+    assert answer_words("Pick", "Mug_1", step, ("body", "so", "height"), written)[:13] == (
         *("body", "so", "height", "Pick", "mug", "_1"),
         *written,
     )

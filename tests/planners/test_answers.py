@@ -50,13 +50,13 @@ def test_a_reflection_comes_first_where_it_is_asked_for() -> None:
 
 def test_a_place_stands_before_the_step_where_it_may_be_said() -> None:
     step, places = PlanStep.parse("MoveDown(0.2)"), AnswerGrammar(IDS, places=True)
-    place = place_words(np.array([0.5, 0.2, 0.3]), -0.6)
+    place = place_words(np.array([0.5, 0.2, 0.3]), np.eye(14, 3))
     words = answer_words("Pick", "Mug_1", step, place=place)
     assert said(words, places) and not said(words, AnswerGrammar(IDS))
     assert said(answer_words("Pick", "Mug_1", step), places)  # it need not be said
     assert said(answer_words("Pick", None, step), places)
     assert "at" not in places.allowed(("Pick", "unseen"))
-    assert places.allowed(words[:6]) == list(PLACES[3]) and places.allowed(words[:7]) == ["do"]
+    assert places.allowed(words[:6]) == list(PLACES[3]) and places.allowed(words[:10]) == ["do"]
     assert read_step(words, places.ids) == step
 
 

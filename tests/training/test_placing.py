@@ -16,7 +16,7 @@ from proprio_mllm.model.named_map import NamedPointMap
 from proprio_mllm.model.placing import stands_alone
 from proprio_mllm.model.point_map import GeoFeatures, Named
 from proprio_mllm.model.word_tokens import tokens_of
-from proprio_mllm.model.wording import id_words, place_words
+from proprio_mllm.model.wording import PLACES, id_words, place_words
 from proprio_mllm.training.pipeline import Pipeline
 from proprio_mllm.training.placing import Places, thing_of
 from proprio_mllm.training.sources import Views
@@ -70,7 +70,7 @@ def test_only_what_is_seen_alone_has_a_place(trained: Pipeline) -> None:
     places = Places(model, finder, demos)
     view = demos.view(demos.reader[row])
     ahead = view.camera.camera_in_pelvis @ np.array([0.0, 0.0, 1.0, 1.0])
-    assert places([(row, thing), (row, other)]) == {row: place_words(ahead[:3], float(view.key_bodies[:, 2].min()))}
+    assert places([(row, thing), (row, other)]) == {row: place_words(ahead[:3], view.key_bodies)}
     torch.nn.init.constant_(finder.scale, -9.0)  # nothing looks like anything
     assert places([(row, thing)]) == {}
 
@@ -93,7 +93,7 @@ def test_answers_say_where_their_thing_is(trained: Pipeline, monkeypatch: pytest
         do = len(answers[row][: answers[row].index("do")])
         if at in learnt:
             changed += 1
-            assert learnt[:do] + learnt[do + 4 :] == words.tokens(answers[row])
+            assert learnt[:do] + learnt[do + len(PLACES) :] == words.tokens(answers[row])
             assert learnt[do] == at
         else:
             assert learnt == words.tokens(answers[row])
@@ -110,7 +110,7 @@ def test_views_are_asked_for_places_too(trained: Pipeline) -> None:
     views = Views(trained.paths.shards("views"), dataclasses.replace(trained.cfg.model, places=True))
     row = next(one for one in map(views.row, views.split.train) if any(int(thing["pixels"]) >= 6 for thing in one.objects))
     asked = views.asked(row, ("place",), 1, np.random.default_rng(0))[0]
-    words = place_words(np.asarray(asked.thing["center_in_pelvis"]), float(row.view.key_bodies[:, 2].min()))
+    words = place_words(np.asarray(asked.thing["center_in_pelvis"]), row.view.key_bodies)
     assert asked.question == f"at {asked.name}" and asked.answer.split() == list(words[1:])
     assert json.dumps(asked.answer)[1] == " "  # its first word is the token of episodes
 

@@ -27,7 +27,7 @@ class PointMapStage:
     name = "pointmap"
     needs = ("practice",)
     shards = ("views",)
-    recipe = 3
+    recipe = 4
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The loop and the encoder."""
