@@ -10,6 +10,7 @@ from proprio_mllm.model.backbone import PUBLISHED
 _ABOUT: Final = {
     "practice": "A language model from scratch that plans in words: it reads the episode so far and answers with a plan step.",
     "base": "The language model of `words` that has learnt to see; it stands in for a pretrained Qwen2.5-VL at this size.",
+    "pointmap": "The point map that also knows what is where: stage `alignment` reads positions of things from it.",
     "alignment": "The base model with motion tokens, motion-based position embedding, cross-spatial encoder (paper, stage 2).",
     "selu": "The aligned model after self-learning (paper, stage 3).",
 }
@@ -25,7 +26,7 @@ _OWN: Final = "It is of a size for tests on a laptop and not comparable with the
 _OTHERS: Final = "What was added to the base model is here; its weights and their licence are where it is."
 _ALONE: Final = ", and on nothing else: no text or picture of people"
 _ADDED: Final = ", beside what the base model had learnt"
-_PLANNERS: Final = {"practice": "words", "base": "base"}
+_PLANNERS: Final = {"practice": "words", "base": "base", "pointmap": "pointmap"}
 
 
 def model_card(provenance: Mapping[str, Any]) -> str:
@@ -38,6 +39,7 @@ def model_card(provenance: Mapping[str, Any]) -> str:
     variant = "full" if stage in _PLANNERS else provenance["variant"]
     planner = _PLANNERS.get(stage, {"full": "proprio", "no_proprio": "no_proprio"}.get(variant, f"proprio_{variant}"))
     name = planner if stage in _PLANNERS else variant
+    use = f"eval.py planner={planner} robot=h1" if stage != "pointmap" else "train.py stage=alignment given=weights"
     rows = [
         f"| {one} | {key} | {value:.4g} |"
         for one, record in provenance["stages"].items()
@@ -61,7 +63,7 @@ language: en
 
 {_ABOUT[stage]}{_WITHOUT[variant]} For the humanoids Unitree H1 and AgiBot X1 in the household simulator of this project.
 
-    python eval.py planner={planner} robot=h1
+    python {use}
 
 **Trained** on what the simulator and the project's rules make{beside}. Seed
 {provenance["seed"]}; shards {shards}. Stored as {provenance["stored_as"]}.

@@ -11,13 +11,14 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, get_args
+from typing import Any, Final, Protocol, get_args
 
 from configs.schema.model import CseConfig, ModelConfig, MpeConfig, PointMapConfig
 from configs.schema.train import LoopConfig, TrainConfig, Variant
 from proprio_mllm.model.building import save_model
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
+from proprio_mllm.model.tensors import file_hashes
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.loop import Objective, run_loop
 from proprio_mllm.training.memory import spare_memory
@@ -29,6 +30,9 @@ from proprio_mllm.training.sources import shard_hash
 logger = logging.getLogger(__name__)
 
 Metrics = dict[str, float]
+
+#: Where released weights hold what a stage trains.
+_GIVEN: Final = {"words": "words", "practice": "words", "pointmap": "pointmap", "tokenizer": "full/motion"}
 
 
 class StageError(RuntimeError):
@@ -168,8 +172,31 @@ class Pipeline:
         stage = self.stages[name]
         inputs = {needed: self.key(needed) for needed in stage.needs}
         inputs |= {kind: shard_hash(self.paths.shards(kind)) for kind in stage.shards}
-        own = {"recipe": stage.recipe, "micro_batches": self.cfg.micro_batches, "keep_spatial": self.cfg.keep_spatial}
+        own: dict[str, Any] = {
+            "recipe": stage.recipe,
+            "micro_batches": self.cfg.micro_batches,
+            "keep_spatial": self.cfg.keep_spatial,
+        }
+        if (given := self.given(name)) is not None:
+            own["given"] = file_hashes(given)
         return stage_key(dict(stage.settings(self)) | own, self.paths.seed(name), inputs)
+
+    def given(self, stage: str) -> Path | None:
+        """The folder of released weights with what a stage would train (`TrainConfig.given`); None where it has to train."""
+        if self.cfg.given is None or stage not in _GIVEN:
+            return None
+        folder = Path(self.cfg.given) / self.cfg.model.name / _GIVEN[stage]
+        return folder if folder.is_dir() else None
+
+    def fits(self, given: Path, has: object, wanted: object) -> None:
+        """Holds what released weights are of against the configuration.
+
+        Raises:
+            StageError: when they differ.
+        """
+        if has != wanted:
+            raise StageError(f"given={self.cfg.given}: {given} is of {has}, the configuration asks for {wanted}")
+        logger.info("taken from %s, not trained", given)
 
     def ancestors(self, name: str) -> tuple[str, ...]:
         """A stage and everything that went into its output, in the order in which they run."""

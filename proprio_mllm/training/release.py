@@ -33,19 +33,21 @@ from proprio_mllm.training.stages.selu import CRITIC
 
 #: Largest size of one released folder of a model from scratch, megabytes: such are kept with the code.
 LARGEST_MB: Final = 30.0
-_MODELS: Final = ("practice", "base", "alignment", "selu")
+#: What all variants share, and all that is released.
+_SHARED: Final = ("practice", "base", "pointmap")
+_RELEASED: Final = (*_SHARED, "alignment", "selu")
 
 
 def release_name(stage: str, variant: str) -> str:
     """Name of a released model: `words` is of practice, the last stage's is the variant's."""
-    return {"practice": "words", "base": "base", "selu": variant}.get(stage, f"{variant}-{stage}")
+    return {"practice": "words", "base": "base", "pointmap": "pointmap", "selu": variant}.get(stage, f"{variant}-{stage}")
 
 
 def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
-    """Copies the models of words and base, and the variant's newest finished model to `folder/<model>/<name>`.
+    """Copies the models of words and base, the point map, and the variant's newest model to `folder/<model>/<name>`.
 
     What rests on a stage that has not finished under this configuration is left out. The model of stage `alignment` is copied
-    only while `selu` has not finished, and those of words and base only when `folder` does not hold the same ones already.
+    only while `selu` has not finished, and what variants share only when `folder` does not hold the same already.
 
     Args:
         pipeline: names folders and keys.
@@ -59,7 +61,7 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
     """
     paths, written = pipeline.paths, list[Path]()
 
-    for stage in _MODELS:
+    for stage in _RELEASED:
         source = paths.model(stage)
         if (
             not source.is_dir()
@@ -69,12 +71,12 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
             continue
         key = pipeline.key(stage)
         target = Path(folder) / pipeline.cfg.model.name / release_name(stage, pipeline.paths.variant)
-        if stage in ("practice", "base") and _released_key(target) == key:  # every variant's export meets them again
+        if stage in _SHARED and _released_key(target) == key:  # every variant's export meets them again
             continue
         with new_folder(target) as work:
             shutil.copytree(source, work, dirs_exist_ok=True)
             _shrink(work)
-            if stage not in ("practice", "base") and (work / "vlm").is_dir():
+            if stage not in _SHARED and (work / "vlm").is_dir():
                 share_backbone(work, target.with_name(release_name("base", "")))
             provenance = _provenance(pipeline, stage, key)
             (work / PROVENANCE).write_text(json.dumps(provenance, indent=1) + "\n", encoding="utf-8")
@@ -95,7 +97,8 @@ def _shrink(folder: Path) -> None:
     """Halves floating-point weights and drops the critic's adapter."""
     shutil.rmtree(folder / "adapters" / CRITIC, ignore_errors=True)
     config = read_json(folder / "config.json")
-    config["adapters"] = [name for name in config["adapters"] if name != CRITIC]
+    if "adapters" in config:
+        config["adapters"] = [name for name in config["adapters"] if name != CRITIC]
     for path in folder.rglob("*.safetensors"):
         if path.parent == folder / "motion":
             continue

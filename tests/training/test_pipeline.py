@@ -267,7 +267,7 @@ def _stopped(*_: object) -> None:
 
 def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written = release.export(trained, tmp_path)
-    assert [folder.name for folder in written] == ["words", "base", "full"]
+    assert [folder.name for folder in written] == ["words", "base", "pointmap", "full"]
     about = json.loads((tmp_path / "tiny" / "full" / "provenance.json").read_text())
     assert list(about["stages"]) == ["words", "practice", "base", "pointmap", "tokenizer", "alignment", "selu"]
     assert all(stage["command"] == "python train.py stage=all" and stage["metrics"] for stage in about["stages"].values())
@@ -298,6 +298,35 @@ def test_release(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(release, "LARGEST_MB", 0.001)
     with pytest.raises(ValueError, match=r"at most 0.001 MB are released"):
         release.export(trained, tmp_path)
+
+
+def test_released_parts_are_taken_and_not_trained(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    release.export(trained, tmp_path / "weights")
+    shutil.copytree(trained.paths.root / "data", tmp_path / "run" / "tiny" / "data")
+    cfg = dataclasses.replace(trained.cfg, output=str(tmp_path / "run"), given=str(tmp_path / "weights"))
+    pipeline = Pipeline(STAGES, cfg, collect, "", correct, Lessons())
+    monkeypatch.setattr(pipeline, "loop", _stopped)
+    for stage in ("words", "practice", "pointmap", "tokenizer"):
+        assert pipeline.key(stage) != trained.key(stage)
+        assert pipeline.run(stage) is not None and pipeline.is_current(stage)
+    ours, theirs = (load_model(one.paths.model("practice")).state_dict() for one in (pipeline, trained))
+    for name, tensor in theirs.items():
+        torch.testing.assert_close(ours[name], tensor, atol=1e-4, rtol=1e-3)
+    for stage in ("pointmap", "tokenizer"):
+        ours, theirs = (load_file(one.paths.model(stage) / "model.safetensors") for one in (pipeline, trained))
+        for name, tensor in theirs.items():
+            torch.testing.assert_close(ours[name], tensor, atol=1e-3, rtol=1e-3)
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.run("base")  # is trained
+
+    wider = dataclasses.replace(cfg.model, text=dataclasses.replace(cfg.model.text, hidden=128))
+    longer = dataclasses.replace(cfg.model, motion=dataclasses.replace(cfg.model.motion, codes=64))
+    for model, stage in ((wider, "words"), (longer, "tokenizer")):
+        with pytest.raises(StageError, match=r"given=.* is of .*, the configuration asks for"):
+            Pipeline(STAGES, dataclasses.replace(cfg, model=model), collect, "", correct, Lessons()).run(stage)
+    shutil.rmtree(tmp_path / "weights" / "tiny" / "pointmap")
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.run("pointmap")  # is not there
 
 
 def test_rollouts_refuse_the_benchmark(tmp_path: Path) -> None:

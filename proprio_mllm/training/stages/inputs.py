@@ -15,6 +15,7 @@ from proprio_mllm.model.tensors import read_tensors
 from proprio_mllm.training.pipeline import Pipeline, seeded
 from proprio_mllm.training.placing import Places
 from proprio_mllm.training.sources import Demos
+from proprio_mllm.training.stages.pointmap import WEIGHTS
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordsObjective, mixed
 
@@ -50,5 +51,5 @@ def point_map_of(pipeline: Pipeline, cfg: ModelConfig) -> nn.Module | None:
     """The point map as its stage left it, or as it comes trained."""
     encoder = seeded(lambda: build_point_map(cfg), pipeline.cfg.seed)
     if encoder is not None and cfg.point_map.encoder in TRAINED_HERE:
-        encoder.load_state_dict(read_tensors(pipeline.paths.stage("pointmap") / "checkpoint" / "model.safetensors"))
+        encoder.load_state_dict(read_tensors(pipeline.paths.model("pointmap") / WEIGHTS))
     return encoder

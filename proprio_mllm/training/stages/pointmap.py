@@ -5,20 +5,26 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from torch import Tensor
 
+from data.files import new_folder, read_json
 from interface.actions import ACTIONS
-from proprio_mllm.model.building import TRAINED_HERE, build_point_map, load_model
+from proprio_mllm.model.building import TRAINED_HERE, build_point_map, load_model, write_stored
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.named_map import NamedPointMap, name_rows
+from proprio_mllm.model.tensors import check_files, read_tensors, write_tensors
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import ID_NUMBERS, MARKERS, name_words
 from proprio_mllm.training.geometry_stage import NamedMapObjective, PointMapObjective, point_map_error
 from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded
+from proprio_mllm.training.processes import first_alone
 from proprio_mllm.training.sources import Views
+
+#: File of the stored encoder.
+WEIGHTS: Final = "model.safetensors"
 
 
 class PointMapStage:
@@ -47,9 +53,29 @@ class PointMapStage:
         else:
             objective = PointMapObjective(encoder, views, key)
         if pipeline.cfg.model.point_map.encoder in TRAINED_HERE:
-            encoder.requires_grad_(True)
-            pipeline.loop(objective, pipeline.cfg.pointmap, folder)
+            if (given := pipeline.given(self.name)) is not None:
+                stored = read_json(given / "config.json")
+                check_files(given, stored.pop("files"))
+                pipeline.fits(given, stored, _about(pipeline))
+                encoder.load_state_dict(read_tensors(given / WEIGHTS))
+            else:
+                encoder.requires_grad_(True)
+                pipeline.loop(objective, pipeline.cfg.pointmap, folder)
+            first_alone(lambda: _store(encoder, _about(pipeline), pipeline.paths.model(self.name)))
         return point_map_error(encoder.eval(), views, names)
+
+
+def _about(pipeline: Pipeline) -> dict[str, Any]:
+    """What a stored point map fits."""
+    model = pipeline.cfg.model
+    size = {"image_size": model.image_size, "hidden": model.text.hidden}
+    return {name: getattr(model.point_map, name) for name in ("encoder", "width", "depth")} | size
+
+
+def _store(encoder: torch.nn.Module, about: Mapping[str, Any], folder: Path) -> None:
+    with new_folder(folder) as work:
+        write_tensors({name: tensor.contiguous() for name, tensor in encoder.state_dict().items()}, work / WEIGHTS)
+        write_stored(work, about)
 
 
 @torch.no_grad()

@@ -59,9 +59,10 @@ class PracticeStage:
         taught, own = lessons.logged(pipeline.paths.shards("lessons")), lessons.logged(shards)
         episode = mixed(lessons.episode, (cfg.own_share, own), (cfg.logged, taught))
         model = load_model(student)
-        model.requires_grad_(False)
-        model.core.model.language_model.requires_grad_(True)
-        pipeline.loop(WordsObjective(model, episode, key, pipeline.cfg.words.reading), cfg.loop, folder / "loop")
+        if pipeline.given(self.name) is None:  # else the student has been through it
+            model.requires_grad_(False)
+            model.core.model.language_model.requires_grad_(True)
+            pipeline.loop(WordsObjective(model, episode, key, pipeline.cfg.words.reading), cfg.loop, folder / "loop")
         pipeline.store("practice", model)
         return {**held_out_metrics(model, {"": lessons.episode, "_logged": taught, "_own": own}), **metrics}
 

@@ -42,9 +42,13 @@ class TokenizerStage:
             rows = [decode_motion(row)[-motion.window :] for row in reader.column("motion")]
             recorded.append(np.stack(rows) if rows else np.zeros((0, motion.window, motion.features), dtype=np.float32))
         windows = MotionWindows(clips, recorded, motion.window)
-        tokenizer = seeded(lambda: MotionTokenizer(motion), pipeline.cfg.seed)
-        tokenizer.set_normalisation(*windows.statistics())
-        pipeline.loop(MotionObjective(tokenizer, windows, key), pipeline.cfg.tokenizer, folder)
+        if (given := pipeline.given(self.name)) is not None:
+            tokenizer = MotionTokenizer.load(given)
+            pipeline.fits(given, tokenizer.cfg, motion)
+        else:
+            tokenizer = seeded(lambda: MotionTokenizer(motion), pipeline.cfg.seed)
+            tokenizer.set_normalisation(*windows.statistics())
+            pipeline.loop(MotionObjective(tokenizer, windows, key), pipeline.cfg.tokenizer, folder)
         first_alone(lambda: tokenizer.eval().save(pipeline.paths.model("tokenizer")))
         first_alone(lambda: render(tokenizer, clips, folder / "pictures"))
         return tokenizer_metrics(tokenizer, windows)

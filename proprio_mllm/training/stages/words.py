@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from configs.schema.model import ModelConfig
-from proprio_mllm.model.building import build_model, build_processor
+from proprio_mllm.model.building import build_model, build_processor, load_model
 from proprio_mllm.model.word_tokens import add_word_tokens
 from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config
 from proprio_mllm.training.words import WordsObjective, held_out_metrics, mixed
@@ -35,13 +35,18 @@ class WordsStage:
             return {}
         lessons, share = pipeline.lessons, pipeline.cfg.words.logged
         cfg = _plain(pipeline.cfg.model)
+        logged = lessons.logged(pipeline.paths.shards("lessons"))
+        if (given := pipeline.given(self.name)) is not None:
+            model = load_model(given)
+            pipeline.fits(given, model.cfg.text, cfg.text)
+            pipeline.store("words", model)
+            return held_out_metrics(model, {"": lessons.episode, "_logged": logged})
         words = lessons.words()
         processor = build_processor(cfg, [" ".join(words)] * 2)
         add_word_tokens(processor.tokenizer, words)
         model = build_model(cfg, processor, pipeline.cfg.seed)
         model.requires_grad_(False)
         model.core.model.language_model.requires_grad_(True)
-        logged = lessons.logged(pipeline.paths.shards("lessons"))
         episode = mixed(lessons.episode, (share, logged))
         objective = WordsObjective(model, episode, key, pipeline.cfg.words.reading)
         pipeline.loop(objective, pipeline.cfg.words.loop, folder / "loop")
