@@ -33,7 +33,7 @@ class PointMapStage:
     name = "pointmap"
     needs = ("practice",)
     shards = ("views",)
-    recipe = 4
+    recipe = 5
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The loop and the encoder."""
