@@ -182,10 +182,19 @@ class Pipeline:
         return stage_key(dict(stage.settings(self)) | own, self.paths.seed(name), inputs)
 
     def given(self, stage: str) -> Path | None:
-        """The folder of released weights with what a stage would train (`TrainConfig.given`); None where it has to train."""
+        """The folder of released weights with what a stage would train (`TrainConfig.given`); None where it has to train.
+
+        Raises:
+            StageError: when there are no released weights of this model.
+        """
         if self.cfg.given is None or stage not in _GIVEN:
             return None
-        folder = Path(self.cfg.given) / self.cfg.model.name / _GIVEN[stage]
+        released = Path(self.cfg.given) / self.cfg.model.name
+        if not released.is_dir():
+            raise StageError(
+                f"given={self.cfg.given}: no folder {released}; it is where released weights are, such as `weights`"
+            )
+        folder = released / _GIVEN[stage]
         return folder if folder.is_dir() else None
 
     def fits(self, given: Path, has: object, wanted: object) -> None:

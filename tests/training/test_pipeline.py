@@ -17,7 +17,7 @@ from configs.schema.train import TrainConfig
 from configs.validate import ConfigError, build
 from data.shards import ShardError, ShardReader, ShardWriter
 from proprio_mllm.evaluation.lessons import Lessons
-from proprio_mllm.model.building import add_adapter, load_model
+from proprio_mllm.model.building import add_adapter, load_model, write_stored
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.tensors import read_tensors
@@ -324,6 +324,17 @@ def test_released_parts_are_taken_and_not_trained(trained: Pipeline, tmp_path: P
     for model, stage in ((wider, "words"), (longer, "tokenizer")):
         with pytest.raises(StageError, match=r"given=.* is of .*, the configuration asks for"):
             Pipeline(STAGES, dataclasses.replace(cfg, model=model), collect, "", correct, Lessons()).run(stage)
+    words = tmp_path / "weights" / "tiny" / "words"  # become others than the point map has learnt
+    file = words / "vlm" / "model.safetensors"
+    save_file({name: 1.5 * tensor for name, tensor in load_file(file).items()}, file, {"format": "pt"})
+    write_stored(words, json.loads((words / "config.json").read_text()))
+    for stage in ("words", "practice"):
+        assert pipeline.run(stage) is not None
+    with pytest.raises(StageError, match=r"tiny/pointmap is of .*'words': "):
+        pipeline.run("pointmap")
+    absent = Pipeline(STAGES, dataclasses.replace(cfg, given=str(tmp_path / "weight")), collect, "", correct, Lessons())
+    with pytest.raises(StageError, match=r"weight: no folder .*such as `weights`"):
+        absent.run("words")
     shutil.rmtree(tmp_path / "weights" / "tiny" / "pointmap")
     with pytest.raises(KeyboardInterrupt):
         pipeline.run("pointmap")  # is not there

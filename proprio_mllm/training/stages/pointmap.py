@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -46,9 +47,11 @@ class PointMapStage:
         if encoder is None or not list(encoder.parameters()):
             return {}
         views = Views(pipeline.paths.shards("views"), pipeline.cfg.model)
-        names = None
+        names, about = None, _about(pipeline)
         if isinstance(encoder, NamedPointMap):
-            names = names_of(load_model(pipeline.paths.model("practice")), views.type_names)
+            words = load_model(pipeline.paths.model("practice"))
+            names = names_of(words, views.type_names)
+            about["words"] = hashlib.sha256(words.table.detach().half().numpy().tobytes()).hexdigest()  # as it is released
             objective = NamedMapObjective(encoder, views, names, key)
         else:
             objective = PointMapObjective(encoder, views, key)
@@ -56,12 +59,12 @@ class PointMapStage:
             if (given := pipeline.given(self.name)) is not None:
                 stored = read_json(given / "config.json")
                 check_files(given, stored.pop("files"))
-                pipeline.fits(given, stored, _about(pipeline))
+                pipeline.fits(given, stored, about)
                 encoder.load_state_dict(read_tensors(given / WEIGHTS))
             else:
                 encoder.requires_grad_(True)
                 pipeline.loop(objective, pipeline.cfg.pointmap, folder)
-            first_alone(lambda: _store(encoder, _about(pipeline), pipeline.paths.model(self.name)))
+            first_alone(lambda: _store(encoder, about, pipeline.paths.model(self.name)))
         return point_map_error(encoder.eval(), views, names)
 
 
