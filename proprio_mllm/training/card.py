@@ -26,7 +26,8 @@ _OWN: Final = "It is of a size for tests on a laptop and not comparable with the
 _OTHERS: Final = "What was added to the base model is here; its weights and their licence are where it is."
 _ALONE: Final = ", and on nothing else: no text or picture of people"
 _ADDED: Final = ", beside what the base model had learnt"
-_PLANNERS: Final = {"practice": "words", "base": "base", "pointmap": "pointmap"}
+#: Names of what all variants share.
+_SHARED: Final = {"practice": "words", "base": "base", "pointmap": "pointmap"}
 
 
 def model_card(provenance: Mapping[str, Any]) -> str:
@@ -36,9 +37,9 @@ def model_card(provenance: Mapping[str, Any]) -> str:
         provenance: as in `provenance.json`.
     """
     stage, model = provenance["stage"], provenance["config"]["model"]["name"]
-    variant = "full" if stage in _PLANNERS else provenance["variant"]
-    planner = _PLANNERS.get(stage, {"full": "proprio", "no_proprio": "no_proprio"}.get(variant, f"proprio_{variant}"))
-    name = planner if stage in _PLANNERS else variant
+    variant = "full" if stage in _SHARED else provenance["variant"]
+    planner = _SHARED.get(stage, {"full": "proprio", "no_proprio": "no_proprio"}.get(variant, f"proprio_{variant}"))
+    name = planner if stage in _SHARED else variant
     use = f"eval.py planner={planner} robot=h1" if stage != "pointmap" else "train.py stage=alignment given=weights"
     rows = [
         f"| {one} | {key} | {value:.4g} |"

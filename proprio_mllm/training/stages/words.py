@@ -33,23 +33,21 @@ class WordsStage:
         """
         if pipeline.needs_no(self.name):
             return {}
-        lessons, share = pipeline.lessons, pipeline.cfg.words.logged
-        cfg = _plain(pipeline.cfg.model)
+        lessons, cfg = pipeline.lessons, _plain(pipeline.cfg.model)
         logged = lessons.logged(pipeline.paths.shards("lessons"))
         if (given := pipeline.given(self.name)) is not None:
             model = load_model(given)
             pipeline.fits(given, model.cfg.text, cfg.text)
-            pipeline.store("words", model)
-            return held_out_metrics(model, {"": lessons.episode, "_logged": logged})
-        words = lessons.words()
-        processor = build_processor(cfg, [" ".join(words)] * 2)
-        add_word_tokens(processor.tokenizer, words)
-        model = build_model(cfg, processor, pipeline.cfg.seed)
-        model.requires_grad_(False)
-        model.core.model.language_model.requires_grad_(True)
-        episode = mixed(lessons.episode, (share, logged))
-        objective = WordsObjective(model, episode, key, pipeline.cfg.words.reading)
-        pipeline.loop(objective, pipeline.cfg.words.loop, folder / "loop")
+        else:
+            words = lessons.words()
+            processor = build_processor(cfg, [" ".join(words)] * 2)
+            add_word_tokens(processor.tokenizer, words)
+            model = build_model(cfg, processor, pipeline.cfg.seed)
+            model.requires_grad_(False)
+            model.core.model.language_model.requires_grad_(True)
+            episode = mixed(lessons.episode, (pipeline.cfg.words.logged, logged))
+            objective = WordsObjective(model, episode, key, pipeline.cfg.words.reading)
+            pipeline.loop(objective, pipeline.cfg.words.loop, folder / "loop")
         pipeline.store("words", model)
         return held_out_metrics(model, {"": lessons.episode, "_logged": logged})
 
