@@ -29,7 +29,7 @@ def save_checkpoint(
         seconds: time spent so far.
     """
     with new_folder(folder) as work:
-        write_tensors(_trained(module), work / "model.safetensors")
+        write_tensors({name: tensor.contiguous() for name, tensor in _trained(module).items()}, work / "model.safetensors")
         state = optimizer.state_dict()["state"]
         entries = [(f"{index}.{name}", value) for index, entry in state.items() for name, value in entry.items()]
         flat = {name: torch.as_tensor(value).contiguous() for name, value in entries}
@@ -69,6 +69,7 @@ def load_checkpoint(folder: Path, module: nn.Module, optimizer: torch.optim.Opti
 
 
 def _trained(module: nn.Module) -> dict[str, Tensor]:
+    """What trains and the buffers, themselves and not copies, in whatever memory format."""
     tensors: dict[str, Tensor] = {}
     seen: set[int] = set()
     for name, parameter in module.named_parameters():
@@ -79,4 +80,4 @@ def _trained(module: nn.Module) -> dict[str, Tensor]:
         if id(buffer) not in seen:
             seen.add(id(buffer))
             tensors[name] = buffer
-    return {name: tensor.contiguous() if not tensor.is_contiguous() else tensor for name, tensor in tensors.items()}
+    return tensors

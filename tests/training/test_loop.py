@@ -10,6 +10,7 @@ import sys
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -169,6 +170,21 @@ def test_kill_and_resume_gives_the_same_weights(tmp_path: Path) -> None:
     assert all(torch.equal(x, y) for x, y in zip(whole, resumed, strict=True))
     rows = (folder / "metrics.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["step", *(str(s) for s in range(5, 31, 5))]
+
+
+def test_weights_of_any_memory_format_are_restored(tmp_path: Path) -> None:
+    class Planes(Line):
+        """The same line by a convolution over pictures of one pixel, channels last."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            plane = nn.Conv2d(3, 8, 3, padding=1)
+            module: Any = nn.Sequential(nn.Unflatten(1, (3, 1, 1)), plane, nn.Flatten(), nn.Linear(8, 1))
+            self.module = module.to(memory_format=torch.channels_last)
+            assert any(not parameter.is_contiguous() for parameter in self.module.parameters())
+
+    learnt, again = run(tmp_path, Planes()), run(tmp_path, Planes())
+    assert all(torch.equal(x, y) for x, y in zip(learnt, again, strict=True))
 
 
 def test_checkpoint_of_another_key_is_not_resumed(tmp_path: Path) -> None:
