@@ -7,48 +7,60 @@ thought; Zawalski et al., 2024). Every variant learns the same words, whether or
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
-from proprio_mllm.model.modeling import ProprioMLLM
-from proprio_mllm.model.named_map import NamedPointMap
 from proprio_mllm.model.placing import Placing, stands_alone
-from proprio_mllm.model.wording import Words
+from proprio_mllm.model.wording import WordEpisode, Words, WordTurn
 from proprio_mllm.training.sources import Demos
 
 _BATCH: Final = 32
 
 
-class Places:
-    """Finds things in the pictures of decisions.
+def placed(episodes: Sequence[WordEpisode], demos: Demos, place: Placing) -> list[WordEpisode]:
+    """Episodes whose answers say where their thing is, where it is alone of its name in the picture and found.
 
     Args:
-        model: gives the tokenizer and the words' rows.
-        encoder: a trained point map that knows what is where.
+        episodes: of the decisions, in their order; the k-th turn of an episode is its k-th row's.
         demos: the decisions.
+        place: finds things.
     """
+    visible, asked = demos.reader.column("visible"), list[tuple[int, Words]]()
+    for start, episode in zip(demos.starts, episodes, strict=True):
+        things = enumerate((thing_of(turn.answer) for turn in episode.turns), start)
+        asked += [(row, thing) for row, thing in things if thing and stands_alone(thing, visible[row])]
+    found: dict[int, Words] = {}
+    for some in (asked[first : first + _BATCH] for first in range(0, len(asked), _BATCH)):
+        said = place([demos.view(demos.reader[row]) for row, _ in some], [thing for _, thing in some])
+        found |= {row: words for (row, _), words in zip(some, said, strict=True)}
+    return [
+        replace(episode, turns=tuple(_at(turn, found.get(row, ())) for row, turn in enumerate(episode.turns, start)))
+        for start, episode in zip(demos.starts, episodes, strict=True)
+    ]
 
-    def __init__(self, model: ProprioMLLM, encoder: NamedPointMap, demos: Demos) -> None:
-        self._place, self._demos = Placing(model, encoder), demos
 
-    def __call__(self, asked: Sequence[tuple[int, Words]]) -> Mapping[int, Words]:
-        """The place of one thing in the picture of each row, where it is alone of its name there and found.
+def _at(turn: WordTurn, place: Words) -> WordTurn:
+    if not place:
+        return turn
+    do = turn.answer.index("do")
+    return replace(turn, answer=(*turn.answer[:do], *place, *turn.answer[do:]))
 
-        Args:
-            asked: rows and the words of ids.
-        """
-        found: dict[int, Words] = {}
-        for start in range(0, len(asked), _BATCH):
-            some = [(row, self._demos.reader[row], thing) for row, thing in asked[start : start + _BATCH]]
-            some = [one for one in some if stands_alone(one[2], one[1]["visible"])]
-            if some:
-                said = self._place([self._demos.view(row) for _, row, _ in some], [thing for *_, thing in some])
-                found |= {number: place for (number, *_), place in zip(some, said, strict=True) if place}
-        return found
+
+def behind_places(episode: WordEpisode) -> WordEpisode:
+    """An episode in which only the step is learnt where a place is known: goal and place are read before it."""
+    return replace(episode, turns=tuple(map(_behind_place, episode.turns)))
+
+
+def _behind_place(turn: WordTurn) -> WordTurn:
+    if "at" not in turn.answer:
+        return turn
+    do = turn.answer.index("do")
+    return replace(turn, now=(*turn.now, *turn.answer[:do]), answer=turn.answer[do:])
 
 
 def thing_of(answer: Words) -> Words:
     """What the sub-goal of an answer is about; nothing where that has not been seen, or there is none."""
-    goal = answer[: answer.index("do")]
+    goal = answer[: answer.index("do")] if answer else ()
     goal = goal[goal.index("so") + 2 :] if "so" in goal else goal
     return () if goal[1:] == ("unseen",) else goal[1:]

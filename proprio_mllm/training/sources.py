@@ -189,7 +189,10 @@ class Demos:
 
     def __init__(self, folder: Path, cfg: ModelConfig, more: Sequence[Path] = ()) -> None:
         self.reader = _Joined([folder, *more])
-        self.split = _Split(self.reader.column("episode"), folder)
+        names = self.reader.column("episode")
+        #: First row of every episode.
+        self.starts = [row for row, name in enumerate(names) if row == 0 or name != names[row - 1]]
+        self.split = _Split(names, folder)
         self.motions = np.stack([decode_motion(m) for m in self.reader.column("motion")])  # (N, T, F)
         #: Rows at which the goals of an episode were met, and those of them that are for training.
         self.ends = np.flatnonzero(np.asarray(self.reader.column("target")) == "Done()")

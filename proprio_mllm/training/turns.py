@@ -8,9 +8,8 @@ them (`Collator.beside`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -22,8 +21,7 @@ from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.observing import pictured_turn
 from proprio_mllm.model.word_tokens import tokens_of
-from proprio_mllm.model.wording import WordEpisode, Words
-from proprio_mllm.training.placing import thing_of
+from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.sources import Demos
 from proprio_mllm.training.words import LONGEST_LOG
 
@@ -40,12 +38,11 @@ class Turns:
     Args:
         model: gives the tokenizer.
         demos: the rows, in the order of their folders.
-        folders: where the rows come from.
-        told: the teacher's answers to every episode of a folder; the k-th turn is the k-th row's.
+        episodes: the teacher's answers to every episode of them; the k-th turn is the k-th row's.
         tokens: the motion tokenizer; None for models without proprioception.
-        places: finds the things that answers are about (`proprio_mllm.training.placing`); None for models that do not say so.
 
     Attributes:
+        episodes: those that are learnt from.
         train: rows that have an answer and are learnt from.
         test: those that are held out.
         codes: (N, T / stride) motion tokens of all rows, None without proprioception.
@@ -55,38 +52,27 @@ class Turns:
         self,
         model: ProprioMLLM,
         demos: Demos,
-        folders: Sequence[Path],
-        told: Callable[[Path], Sequence[WordEpisode]],
+        episodes: Sequence[WordEpisode],
         tokens: MotionTokenizer | None = None,
-        places: Callable[[Sequence[tuple[int, Words]]], Mapping[int, Words]] | None = None,
     ) -> None:
         self._model, self._demos = model, demos
         self.codes = None if tokens is None else demos.tokens(tokens)
         self._told: dict[int, tuple[list[int], list[int], list[int]]] = {}
-        names = demos.reader.column("episode")
-        weights = np.ones(len(names))
-        starts = [row for row, name in enumerate(names) if row == 0 or name != names[row - 1]]
-        episodes = [episode for folder in folders for episode in told(folder)]
-        turns = {start + k: turn for start, one in zip(starts, episodes, strict=True) for k, turn in enumerate(one.turns)}
-        things = [(row, thing_of(turn.answer)) for row, turn in turns.items() if turn.answer] if places else []
-        found = places([(row, thing) for row, thing in things if thing]) if places else {}
-        for start, episode in zip(starts, episodes, strict=True):
-            words = tokens_of(model.processor.tokenizer)
+        weights = np.ones(len(demos.motions))
+        words = tokens_of(model.processor.tokenizer)
+        for start, episode in zip(demos.starts, episodes, strict=True):
             log = words.tokens(episode.prefix)
             for number, turn in enumerate(episode.turns):
-                answer, place = turn.answer, found.get(start + number, ())
-                if place:
-                    do = answer.index("do")
-                    answer = (*answer[:do], *place, *answer[do:])
                 if len(log) <= LONGEST_LOG * words.length:  # as in stage `words`
-                    self._told[start + number] = (list(log), words.tokens(turn.now), words.tokens(answer))
+                    self._told[start + number] = (list(log), words.tokens(turn.now), words.tokens(turn.answer))
                 log += words.tokens(turn.taken)
                 weights[start + number] = _TRIED if turn.tries else 1.0
         rows = np.array(sorted(self._told), dtype=np.int64)
+        self.episodes = [one for start, one in zip(demos.starts, episodes, strict=True) if start in demos.split.train]
         self.train, self.test = np.intersect1d(rows, demos.split.train), np.intersect1d(rows, demos.split.test)
         self._collator = Collator(model.processor, model.cfg)
         #: Training rows of each episode.
-        ends = np.searchsorted(self.train, [*starts[1:], len(names)])
+        ends = np.searchsorted(self.train, [*demos.starts[1:], len(weights)])
         self._episodes = [rows for rows in np.split(self.train, ends[:-1]) if len(rows)]
         #: How often each of them is drawn, relative to the others.
         self._weights = [weights[rows] for rows in self._episodes]

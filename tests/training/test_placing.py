@@ -13,14 +13,14 @@ from torch.nn import functional
 from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.building import load_model
 from proprio_mllm.model.named_map import NamedPointMap
-from proprio_mllm.model.placing import stands_alone
+from proprio_mllm.model.placing import Placing, stands_alone
 from proprio_mllm.model.point_map import GeoFeatures, Named
 from proprio_mllm.model.word_tokens import tokens_of
-from proprio_mllm.model.wording import PLACES, id_words, place_words
+from proprio_mllm.model.wording import PLACES, WordEpisode, Words, WordTurn, id_words, place_words
 from proprio_mllm.training.pipeline import Pipeline
-from proprio_mllm.training.placing import Places, thing_of
+from proprio_mllm.training.placing import behind_places, placed, thing_of
 from proprio_mllm.training.sources import Views
-from proprio_mllm.training.stages.inputs import lessons_of, point_map_of, turns_of
+from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, point_map_of, turns_of
 
 
 class Finder(NamedPointMap):
@@ -65,14 +65,51 @@ def test_only_what_is_seen_alone_has_a_place(trained: Pipeline) -> None:
     demos, words = lessons_of(trained, model.cfg), tokens_of(model.processor.tokenizer)
     row, visible = next((i, one) for i, one in enumerate(demos.reader.column("visible")) if one)
     thing = id_words(visible[0])
-    other = (*thing[:-1], "_16")
+    which = max(i for i, start in enumerate(demos.starts) if start <= row)
+    nothing = WordTurn((), (), ())
+
+    def answers(*asked: Words) -> list[WordEpisode]:
+        """An episode for every one of the demonstrations; the row's answers are about these."""
+        turns = [nothing] * (row - demos.starts[which]) + [WordTurn((), ("Pick", *one, "do", "Done"), ()) for one in asked]
+        return [WordEpisode((), tuple(turns) if number == which else ()) for number in range(len(demos.starts))]
+
     finder = Finder(model.table.detach()[words.tokens(thing[:-1])].mean(0))
-    places = Places(model, finder, demos)
     view = demos.view(demos.reader[row])
     ahead = view.camera.camera_in_pelvis @ np.array([0.0, 0.0, 1.0, 1.0])
-    assert places([(row, thing), (row, other)]) == {row: place_words(ahead[:3], view.key_bodies)}
+    place = place_words(ahead[:3], view.key_bodies)
+    assert placed(answers(thing), demos, Placing(model, finder))[which].turns[-1].answer == (
+        "Pick",
+        *thing,
+        *place,
+        "do",
+        "Done",
+    )
+    other = answers((*thing[:-1], "_16"))
+    assert placed(other, demos, Placing(model, finder)) == other
     torch.nn.init.constant_(finder.scale, -9.0)  # nothing looks like anything
-    assert places([(row, thing)]) == {}
+    assert placed(answers(thing), demos, Placing(model, finder)) == answers(thing)
+
+
+def test_behind_a_place_only_the_step_is_learnt() -> None:
+    place = place_words(np.array([0.5, 0.1, 0.2]), np.zeros((14, 3)) + np.eye(14, 3))
+    here, there = WordTurn(("now",), ("Pick", "mug", "_1", *place, "do", "MoveDown", "."), ("log",)), WordTurn((), ("x",), ())
+    first, second = behind_places(WordEpisode(("H1",), (here, there))).turns
+    assert first == WordTurn(("now", "Pick", "mug", "_1", *place), ("do", "MoveDown", "."), ("log",))
+    assert second == there
+
+
+def test_models_that_say_places_learn_the_simulators_steps_behind_them(trained: Pipeline) -> None:
+    model = load_model(trained.paths.model("base"))
+    turns = turns_of(trained, model, lessons_of(trained, model.cfg))
+    place = place_words(np.array([0.5, 0.1, 0.2]), np.zeros((14, 3)) + np.eye(14, 3))
+    turns.episodes = [WordEpisode(("H1",), (WordTurn(("now",), ("Pick", "mug", "_1", *place, "do", "Done", "."), ()),))]
+    do, found = tokens_of(model.processor.tokenizer).tokens(["do"])[0], []
+    for places in (False, True):
+        model.cfg = dataclasses.replace(model.cfg, places=places)
+        parts = episodes_in_words(trained, model, "key", turns).batch(np.random.default_rng(0), 40)
+        firsts = [part.labels[:, 1:][(part.labels[:, 1:] >= 0) & (part.labels[:, :-1] < 0)] for part in parts]
+        found.append(any(do in first for first in firsts))
+    assert found == [False, True]
 
 
 def test_answers_say_where_their_thing_is(trained: Pipeline, monkeypatch: pytest.MonkeyPatch) -> None:

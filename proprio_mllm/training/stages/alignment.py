@@ -31,7 +31,7 @@ class AlignmentStage:
     name = "alignment"
     needs = ("base", "practice", "pointmap", "tokenizer")
     shards = ("lessons",)
-    recipe = 16
+    recipe = 17
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The phases and the variant's model."""
@@ -46,7 +46,8 @@ class AlignmentStage:
         views, clips = Views(pipeline.paths.shards("views"), model.cfg), Clips(pipeline.paths.shards("clips"))
         read = tokenizer if model.cfg.proprioception else None
         demos = lessons_of(pipeline, model.cfg)
-        turns, words = turns_of(pipeline, model, demos, read), episodes_in_words(pipeline, model, f"{key}/words")
+        turns = turns_of(pipeline, model, demos, read)
+        words = episodes_in_words(pipeline, model, f"{key}/words", turns)
         data = AlignmentData(model, tokenizer, clips, views, demos, turns, words, pipeline.cfg.alignment)
         for phase, about in PHASES.items():
             if phase == "text" and not model.cfg.proprioception:  # there is no motion to align with text

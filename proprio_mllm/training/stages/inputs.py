@@ -11,9 +11,10 @@ from proprio_mllm.model.building import TRAINED_HERE, build_point_map
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.named_map import NamedPointMap
+from proprio_mllm.model.placing import Placing
 from proprio_mllm.model.tensors import read_tensors
 from proprio_mllm.training.pipeline import Pipeline, seeded
-from proprio_mllm.training.placing import Places
+from proprio_mllm.training.placing import behind_places, placed
 from proprio_mllm.training.sources import Demos
 from proprio_mllm.training.stages.pointmap import WEIGHTS
 from proprio_mllm.training.turns import Turns
@@ -33,18 +34,27 @@ def lessons_of(pipeline: Pipeline, model: ModelConfig) -> Demos:
     return Demos(first, model, more)
 
 
-def episodes_in_words(pipeline: Pipeline, model: ProprioMLLM, key: str) -> WordsObjective:
-    """Episodes of the text world and of the simulator, in the shares of stage `practice`."""
+def episodes_in_words(pipeline: Pipeline, model: ProprioMLLM, key: str, turns: Turns | None = None) -> WordsObjective:
+    """Episodes of the text world and of the simulator, in the shares of stage `practice`.
+
+    Of a model whose answers say where things are, the simulator's are those of `turns`, whose places are read.
+    """
     lessons, cfg = pipeline.lessons, pipeline.cfg.practice
+    if turns is not None and model.cfg.places:
+        told = [behind_places(episode) for episode in turns.episodes]
+        seen = (cfg.logged + cfg.own_share, lambda seed: told[seed // 1000 % len(told)])
+        return WordsObjective(model, mixed(lessons.episode, seen), key)
     shares = zip((cfg.logged, cfg.own_share), map(lessons.logged, lesson_folders(pipeline)), strict=False)
     return WordsObjective(model, mixed(lessons.episode, *shares), key)
 
 
 def turns_of(pipeline: Pipeline, model: ProprioMLLM, demos: Demos, tokens: MotionTokenizer | None = None) -> Turns:
     """Decisions with pictures of the rows of `lessons_of`; with the places of things where the model says them."""
+    episodes = [episode for folder in lesson_folders(pipeline) for episode in pipeline.lessons.told(folder)]
     encoder = point_map_of(pipeline, pipeline.cfg.model) if model.cfg.places else None
-    places = Places(model, encoder, demos) if isinstance(encoder, NamedPointMap) else None
-    return Turns(model, demos, lesson_folders(pipeline), pipeline.lessons.told, tokens, places)
+    if isinstance(encoder, NamedPointMap):
+        episodes = placed(episodes, demos, Placing(model, encoder))
+    return Turns(model, demos, episodes, tokens)
 
 
 def point_map_of(pipeline: Pipeline, cfg: ModelConfig) -> nn.Module | None:
