@@ -13,6 +13,7 @@ This is the bridge that `train.py` wires: training asks for the episode of a see
 from __future__ import annotations
 
 import functools
+import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
@@ -33,6 +34,7 @@ from proprio_mllm.evaluation.showing import as_bit
 from proprio_mllm.model.wording import (
     ID_NUMBERS,
     MARKERS,
+    PLACE_SCALES,
     WordEpisode,
     WordTurn,
     answer_words,
@@ -128,7 +130,8 @@ class Lessons:
         ]
         other = [*ORDINALS, *_COUNTS, "a", "an", "the", "in", "on", "from", "off"]
         codes = [str(code) for code in FAILURES]
-        words = (*MARKERS, *self._robots, *ACTIONS, *codes, *ID_NUMBERS, *number_words(), *names, *spoken, *other)
+        numbers = (*number_words(), *itertools.chain.from_iterable(PLACE_SCALES))
+        words = (*MARKERS, *self._robots, *ACTIONS, *codes, *ID_NUMBERS, *numbers, *names, *spoken, *other)
         return tuple(dict.fromkeys(words))
 
     def episode(self, seed: int) -> WordEpisode:

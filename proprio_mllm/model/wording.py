@@ -52,8 +52,8 @@ MARKERS: Final = (
     "fail", "tried", "far", "up", "down", "top", "bottom", "low", "blocked", "many", "bent", "s", "ok", "why", "so",
     *CAUSES, *CHANGES,
 )  # fmt: skip
-#: Steps of the numbers of a place: degrees, and metres up to the last that is said.
-_PLACE_DEG, _PLACE_M, _PLACE_FAR_M = 10, 0.1, 2.0
+#: Steps of the numbers of a place: degrees; metres or arm lengths, up to the last that is said.
+_PLACE_DEG, _PLACE_STEP, _PLACE_FAR = 10, 0.1, 2.0
 _TYPE_WORD: Final = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z0-9]+|[A-Z]+")
 _TEXT_WORD: Final = re.compile(r"[a-z0-9]+|[,.;:]")
 _STATES: Final[Mapping[Condition, tuple[str, str]]] = {
@@ -137,25 +137,40 @@ def place_words(center: NDArray[np.floating], key_bodies: NDArray[np.floating]) 
     from_pelvis, arm_m = np.asarray(center, dtype=np.float64), arm_length_m(key_bodies)
     from_shoulders = from_pelvis - shoulders(key_bodies)
     reaches = np.linalg.norm(from_shoulders, axis=1) / arm_m
-    metres = (math.hypot(*from_pelvis[:2]), float(from_pelvis[2]) - floor_m(key_bodies), *map(float, reaches))
+    metres = (math.hypot(*from_pelvis[:2]), float(from_pelvis[2]) - floor_m(key_bodies))
     x, y, z = from_shoulders.mean(axis=0)
-    return ("at", _place_deg(*from_pelvis[:2]), *map(_place_m, metres), _place_deg(math.hypot(x, y), z))
+    return (
+        "at",
+        _angle(*from_pelvis[:2]),
+        *(_upto(value, "m") for value in metres),
+        *(_upto(float(value), "arm") for value in reaches),
+        _angle(math.hypot(x, y), z),
+    )
 
 
-def _place_deg(x: float, y: float) -> str:
-    return f"{round(math.degrees(math.atan2(y, x)) / _PLACE_DEG) * _PLACE_DEG}d"
+def _angle(x: float, y: float) -> str:
+    return f"{round(math.degrees(math.atan2(y, x)) / _PLACE_DEG) * _PLACE_DEG}deg"
 
 
-def _place_m(value: float) -> str:
-    return f"{min(max(round(value / _PLACE_M), 1) * _PLACE_M, _PLACE_FAR_M):.2f}"
+def _upto(value: float, unit: str) -> str:
+    return f"{min(max(round(value / _PLACE_STEP), 1) * _PLACE_STEP, _PLACE_FAR):.1f}{unit}"
 
 
+#: The values that a place may have, in order: angles, metres, arm lengths. No other part of an episode has these words.
+PLACE_SCALES: Final = (
+    (_ANGLES := tuple(f"{angle}deg" for angle in range(-180, 181, _PLACE_DEG))),
+    *(
+        tuple(_upto(step * _PLACE_STEP, unit) for step in range(1, round(_PLACE_FAR / _PLACE_STEP) + 1))
+        for unit in ("m", "arm")
+    ),
+)
 #: The words that a place may have, one after the other.
 PLACES: Final = (
     ("at",),
-    (_TURNS := tuple(f"{angle}d" for angle in range(-180, 181, _PLACE_DEG))),
-    *[tuple(_place_m(step * _PLACE_M) for step in range(1, round(_PLACE_FAR_M / _PLACE_M) + 1))] * 4,
-    _TURNS[len(_TURNS) // 4 : -(len(_TURNS) // 4)],
+    _ANGLES,
+    *[PLACE_SCALES[1]] * 2,
+    *[PLACE_SCALES[2]] * 2,
+    _ANGLES[len(_ANGLES) // 4 : -(len(_ANGLES) // 4)],
 )
 
 

@@ -2,7 +2,7 @@
 
 | phase | pairs | trains | frozen |
 |---|---|---|---|
-| text (2a-i) | motion to text, to body state and back, masked motion, replay | motion rows, LoRA | vision, merger, CSE |
+| text (2a-i) | motion to text, to body state and back, masked motion, words | motion rows, LoRA | vision, merger, CSE |
 | image (2a-ii) | motion and image to text, motion to body state, replay | motion rows, LoRA, CSE, MPE | vision, merger |
 | joint (2b) | all of them | motion rows, LoRA, CSE, MPE, merger | vision, backbone |
 
@@ -11,10 +11,10 @@ motion meets text, and while motion and CSE meet images. LoRA trains throughout:
 before the language model looks the token up by the object's name, which CSE alone cannot teach it. Besides clip captions,
 motion and image to text holds questions about the robot's own body in its scene (which arm reaches an object, how far the body
 must go down), and motion to text asks which hands are open and how high the pelvis is, which captions do not say and planning
-needs. Wherever LoRA trains, a share of decisions, with motion tokens before their answers, and of episodes in words keeps what
-was learnt before; the paper does not mention any such replay.
+needs. Wherever LoRA trains, a share of episodes in words keeps what was learnt before, and where images are read, a share of
+decisions with pictures, and motion tokens before their answers; the paper does not mention any such replay.
 
-The control `variant=no_proprio` has no text phase, and of the others' pairs those that need no motion.
+The control `variant=no_proprio` has the same phases, and of their pairs those that need no motion.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Phase:
 
 
 PHASES: Final[Mapping[str, Phase]] = {
-    "text": Phase(("rows", "lora"), ("say", "feel", "feel", "feel", "do", "fill", "plan")),
+    "text": Phase(("rows", "lora"), ("say", "feel", "feel", "feel", "do", "fill", "text")),
     "image": Phase(("rows", "lora", "cse", "mpe"), ("say_image", "feel", "body", "body", "body", "body", "plan")),
     "joint": Phase(
         ("rows", "lora", "cse", "mpe", "merger"),
@@ -182,16 +182,16 @@ class AlignmentObjective(Objective):
         self.key = key
         kinds = PHASES[phase].kinds
         self._data, self._cfg = data, cfg
-        self._kinds: tuple[Kind, ...] = kinds if model.cfg.proprioception else ("body", "plan")
+        self._others = [kind for kind in kinds if kind == "body" or (model.cfg.proprioception and kind not in ("plan", "text"))]
+        self._text_share = cfg.text_share if "plan" in kinds else 1.0
 
     def kind(self, rng: np.random.Generator) -> Kind:
         """Drawn anew each step."""
-        others: tuple[Kind, ...] = tuple(kind for kind in self._kinds if kind != "plan")
-        if "plan" in self._kinds and rng.random() < self._cfg.plan_share:
-            if rng.random() < self._cfg.text_share:
+        if not self._others or rng.random() < self._cfg.plan_share:
+            if rng.random() < self._text_share:
                 return "text"
             return "judge" if rng.random() < self._cfg.judge_share else "plan"
-        return others[int(rng.integers(len(others)))]
+        return self._others[int(rng.integers(len(self._others)))]
 
     def batch(self, rng: np.random.Generator, size: int, kind: Kind) -> Parts:
         """A batch of a kind."""

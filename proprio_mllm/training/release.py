@@ -46,8 +46,9 @@ def release_name(stage: str, variant: str) -> str:
 def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
     """Copies the models of words and base, the point map, and the variant's newest model to `folder/<model>/<name>`.
 
-    What rests on a stage that has not finished under this configuration is left out. The model of stage `alignment` is copied
-    only while `selu` has not finished, and what variants share only when `folder` does not hold the same already.
+    What rests on a stage that has not finished under this configuration is left out, and so is what was taken from released
+    weights. The model of stage `alignment` is copied only while `selu` has not finished, and what variants share only when
+    `folder` does not hold the same already.
 
     Args:
         pipeline: names folders and keys.
@@ -65,6 +66,7 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
         source = paths.model(stage)
         if (
             not source.is_dir()
+            or pipeline.given(stage) is not None
             or not all(map(pipeline.is_current, pipeline.ancestors(stage)))
             or (stage == "alignment" and pipeline.is_current("selu"))
         ):

@@ -1,12 +1,16 @@
-"""What the tiny model starts from: the text that its tokenizer is trained on, and rows of type names that mean their words."""
+"""What the tiny model starts from: the text that its tokenizer is trained on, rows of type names that mean their words, and
+rows of places that are in order.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
+from torch.nn import functional
 
 from configs.schema.model import ModelConfig
 from interface.actions import ACTIONS
@@ -14,9 +18,12 @@ from proprio_mllm.model.chat import render
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import critic_prompt, looking, self_ask_prompt
 from proprio_mllm.model.word_tokens import tokens_of
-from proprio_mllm.model.wording import name_words
+from proprio_mllm.model.wording import MARKERS, PLACE_SCALES, name_words
 from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
+
+#: Waves over a scale of values.
+_WAVES: Final = torch.tensor([0.25, 0.5, 1.0, 2.0, 4.0])
 
 
 def corpus(
@@ -76,6 +83,29 @@ def start_from_words(model: ProprioMLLM, names: Sequence[str]) -> None:
             raise ValueError(f"type {name!r} is {len(own)} tokens; it must be one")
         words = spelt.tokens(name_words(name))
         rows[own[0]] = rows[words].sum(0) / len(words) ** 0.5
+
+
+@torch.no_grad()
+def order_places(model: ProprioMLLM, seed: int = 0) -> None:
+    """Lets the rows of the words of places start so that near values resemble each other, as numbers do in a pretrained model.
+
+    A row is a direction that all of a scale share, and waves over the scale, the longest four times as long as it. Rows that
+    are never learnt all come to look the same: without this a language model cannot tell 1.1 arm lengths from 1.3.
+
+    Args:
+        model: has been given the rows of a language model that has learnt; theirs is the length of these.
+        seed: of the directions.
+    """
+    tokens, rows = tokens_of(model.processor.tokenizer), model.core.get_input_embeddings().weight
+    generator = torch.Generator().manual_seed(seed)
+    length = rows[tokens.tokens(MARKERS)].norm(dim=1).median()
+    for scale in PLACE_SCALES:
+        turns = torch.linspace(0.0, 2.0 * math.pi, len(scale))[:, None] * _WAVES
+        values = torch.cat([torch.ones(len(scale), 1), turns.cos(), turns.sin()], dim=1)
+        directions = functional.normalize(torch.randn(values.shape[1], rows.shape[1], generator=generator), dim=1)
+        for word, row in zip(scale, functional.normalize(values @ directions, dim=1), strict=True):
+            if len(own := tokens.tokens([word])) == 1:  # a pretrained tokenizer spells them, and knows numbers
+                rows[own[0]] = length * row.to(rows)
 
 
 @torch.no_grad()

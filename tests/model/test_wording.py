@@ -12,6 +12,7 @@ from interface.sightings import Shown, Sightings
 from interface.steps import PlanStep
 from proprio_mllm.model.wording import (
     MARKERS,
+    PLACE_SCALES,
     PLACES,
     answer_words,
     id_words,
@@ -131,12 +132,12 @@ def test_answers(verb: str, target: str | None, step: str, words: str) -> None:
 @pytest.mark.parametrize(
     ("center", "words"),
     [
-        ((0.6, 0.0, 0.3), "at 0d 0.60 0.90 1.30 1.30 -10d"),
-        ((0.5, 0.2, 0.4), "at 20d 0.50 1.00 1.00 1.30 0d"),
-        ((0.0, -0.2, -0.1), "at -90d 0.20 0.50 1.30 1.00 -70d"),  # straight below the right shoulder
-        ((0.3, -0.3, -0.58), "at -40d 0.40 0.10 2.00 2.00 -70d"),  # halves go to the even one
-        ((0.0, 5.0, 9.0), "at 90d 2.00 2.00 2.00 2.00 60d"),
-        ((-1.0, -1e-9, -0.6), "at -180d 1.00 0.10 2.00 2.00 -40d"),
+        ((0.6, 0.0, 0.3), "at 0deg 0.6m 0.9m 1.3arm 1.3arm -10deg"),
+        ((0.5, 0.2, 0.4), "at 20deg 0.5m 1.0m 1.0arm 1.3arm 0deg"),
+        ((0.0, -0.2, -0.1), "at -90deg 0.2m 0.5m 1.3arm 1.0arm -70deg"),  # straight below the right shoulder
+        ((0.3, -0.3, -0.58), "at -40deg 0.4m 0.1m 2.0arm 2.0arm -70deg"),  # halves go to the even one
+        ((0.0, 5.0, 9.0), "at 90deg 2.0m 2.0m 2.0arm 2.0arm 60deg"),
+        ((-1.0, -1e-9, -0.6), "at -180deg 1.0m 0.1m 2.0arm 2.0arm -40deg"),
     ],
 )
 def test_places(center: tuple[float, float, float], words: str) -> None:
@@ -148,7 +149,8 @@ def test_places(center: tuple[float, float, float], words: str) -> None:
     written = place_words(np.array(center), bodies)
     assert " ".join(written) == words
     assert all(word in may for word, may in zip(written, PLACES, strict=True))
-    assert {word for may in PLACES[1:] for word in may} <= set(number_words())
+    assert {word for may in PLACES[1:] for word in may} == {word for scale in PLACE_SCALES for word in scale}
+    assert not {word for scale in PLACE_SCALES for word in scale} & {*number_words(), *MARKERS}
     step = PlanStep.parse("MoveDown(0.2)")
     assert answer_words("Pick", "Mug_1", step, ("body", "so", "height"), written)[:13] == (
         *("body", "so", "height", "Pick", "mug", "_1"),

@@ -61,12 +61,12 @@ def test_a_place_stands_before_the_step_where_it_may_be_said() -> None:
 
 
 def test_a_place_that_is_told_is_said() -> None:
-    step, place = PlanStep.parse("MoveDown(0.2)"), ("at", "20d", "0.60", "0.90")
+    step, place = PlanStep.parse("MoveDown(0.2)"), ("at", "20deg", "0.6m", "0.9arm")
     asked: list[Words] = []
     told = AnswerGrammar(IDS, places=True, place=lambda thing: asked.append(thing) or (place if thing[0] == "mug" else ()))
     words = answer_words("Pick", "Mug_1", step, place=place)
     assert said(words, told) and set(asked) == {("mug", "_1")}
-    assert [told.allowed(words[:size]) for size in range(3, 8)] == [["at"], ["20d"], ["0.60"], ["0.90"], ["do"]]
+    assert [told.allowed(words[:size]) for size in range(3, 8)] == [["at"], ["20deg"], ["0.6m"], ["0.9arm"], ["do"]]
     assert told.allowed(("Pick", "zubo", "_1")) == ["do"]
     assert said(answer_words("Pick", None, step), told) and said(answer_words("Done", "", PlanStep.parse("Done()")), told)
 

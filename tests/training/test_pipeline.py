@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -103,7 +104,20 @@ def test_the_control_trains_without_motion(trained: Pipeline) -> None:
     assert model.cse is None
     assert not (control.paths.model("selu") / "motion").exists()
     phases = {path.name for path in control.paths.stage("alignment").iterdir() if path.is_dir()}
-    assert phases == {"image", "joint", "model"}
+    assert phases == {"text", "image", "joint", "model"}
+
+
+@pytest.mark.parametrize("phase", list(PHASES))
+def test_pictures_are_read_from_phase_image_on_and_motion_by_models_that_feel(trained: Pipeline, phase: str) -> None:
+    drawn: dict[str, set[str]] = {}
+    for variant in ("full", "no_proprio"):
+        model = start(Pipeline(STAGES, dataclasses.replace(trained.cfg, variant=variant), collect, lessons=Lessons()))
+        objective = AlignmentObjective(model, None, phase, trained.cfg.alignment, "test")  # type: ignore[arg-type]
+        rng = np.random.default_rng(0)
+        drawn[variant] = {objective.kind(rng) for _ in range(400)}
+    pictured = {"body", "plan", "judge"} if phase != "text" else set[str]()
+    assert drawn["no_proprio"] == {"text"} | pictured
+    assert drawn["full"] > drawn["no_proprio"] | {"feel"} and ("say_image" in drawn["full"]) is bool(pictured)
 
 
 def test_another_seed_of_alignment_goes_on_from_the_shared_stages(trained: Pipeline, tmp_path: Path) -> None:
@@ -318,6 +332,7 @@ def test_released_parts_are_taken_and_not_trained(trained: Pipeline, tmp_path: P
             torch.testing.assert_close(ours[name], tensor, atol=1e-3, rtol=1e-3)
     with pytest.raises(KeyboardInterrupt):
         pipeline.run("base")  # is trained
+    assert release.export(pipeline, tmp_path / "weights") == [], "what was taken from there keeps its provenance"
 
     wider = dataclasses.replace(cfg.model, text=dataclasses.replace(cfg.model.text, hidden=128))
     longer = dataclasses.replace(cfg.model, motion=dataclasses.replace(cfg.model.motion, codes=64))

@@ -7,12 +7,16 @@ from typing import Any
 
 import pytest
 import torch
+from torch.nn import functional
 
 from configs.schema.model import ModelConfig
+from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.building import build_model, build_processor
 from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.word_tokens import add_word_tokens, tokens_of
+from proprio_mllm.model.wording import PLACE_SCALES
 from proprio_mllm.training.sources import Clips, Views
-from proprio_mllm.training.text import corpus, start_from_words, whole_words
+from proprio_mllm.training.text import corpus, order_places, start_from_words, whole_words
 
 
 @pytest.fixture
@@ -44,6 +48,21 @@ def test_a_type_name_starts_as_its_words(fresh: ProprioMLLM) -> None:
     assert similar(coffee_table, row(fresh, " coffee table"), 0) > 0.99
     assert similar(coffee_table, row(fresh, " lamp"), 0) < 0.5
     assert torch.equal(others, row(fresh, "Mug"))
+
+
+def test_places_start_in_order(fresh: ProprioMLLM) -> None:
+    add_word_tokens(fresh.processor.tokenizer, Lessons().words())
+    fresh = build_model(fresh.cfg, fresh.processor)
+    before = fresh.table.detach().clone()
+    order_places(fresh)
+    tokens, table = tokens_of(fresh.processor.tokenizer), fresh.table.detach()
+    changed = set((before != table).any(dim=1).nonzero().flatten().tolist())
+    assert changed == {tokens.tokens([word])[0] for scale in PLACE_SCALES for word in scale}
+    for scale in PLACE_SCALES:
+        rows = functional.normalize(table[[tokens.tokens([word])[0] for word in scale]], dim=1)
+        alike = rows @ rows.T
+        near, far = alike.diagonal(1), alike.diagonal(len(scale) // 3)
+        assert bool((near > 0.6).all()) and float(near.max()) < 0.999 and float(far.max()) < float(near.min())
 
 
 def test_a_name_of_several_tokens_is_refused(fresh: ProprioMLLM) -> None:

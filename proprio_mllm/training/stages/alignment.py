@@ -50,8 +50,6 @@ class AlignmentStage:
         words = episodes_in_words(pipeline, model, f"{key}/words", turns)
         data = AlignmentData(model, tokenizer, clips, views, demos, turns, words, pipeline.cfg.alignment)
         for phase, about in PHASES.items():
-            if phase == "text" and not model.cfg.proprioception:  # there is no motion to align with text
-                continue
             train_only(model, about.groups)
             objective = AlignmentObjective(model, data, phase, pipeline.cfg.alignment, f"{key}/{phase}")
             pipeline.loop(objective, getattr(pipeline.cfg.alignment, phase), folder / phase)

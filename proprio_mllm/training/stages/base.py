@@ -16,7 +16,7 @@ from proprio_mllm.training.base import DenseObjective, JointObjective, grounding
 from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config, seeded
 from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
 from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
-from proprio_mllm.training.text import adopt, corpus, start_from_words, whole_words
+from proprio_mllm.training.text import adopt, corpus, order_places, start_from_words, whole_words
 from proprio_mllm.training.turns import turn_accuracy
 from proprio_mllm.training.words import held_out_metrics
 
@@ -27,7 +27,7 @@ class BaseStage:
     name = "base"
     needs = ("practice",)
     shards = ("views", "lessons", "clips")
-    recipe = 9
+    recipe = 10
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """Of the tokenizer only the words: no stage before it, and no motion in its prompts."""
@@ -48,6 +48,7 @@ class BaseStage:
         model = build_model(plain, processor, cfg.seed)
         adopt(model, load_model(pipeline.paths.model("practice")))
         start_from_words(model, views.type_names)
+        order_places(model, cfg.seed)
         words = tokens_of(processor.tokenizer)
         head = seeded(lambda: DenseHead([words.tokens(name_words(name)) for name in views.type_names]), cfg.seed)
         dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 from torch import nn
 
@@ -19,6 +20,9 @@ from proprio_mllm.training.sources import Demos
 from proprio_mllm.training.stages.pointmap import WEIGHTS
 from proprio_mllm.training.turns import Turns
 from proprio_mllm.training.words import WordsObjective, mixed
+
+#: Share of the simulator's episodes among those in words, where their places are read.
+_BEHIND_PLACES: Final = 0.6
 
 
 def lesson_folders(pipeline: Pipeline) -> list[Path]:
@@ -42,7 +46,7 @@ def episodes_in_words(pipeline: Pipeline, model: ProprioMLLM, key: str, turns: T
     lessons, cfg = pipeline.lessons, pipeline.cfg.practice
     if turns is not None and model.cfg.places:
         told = [behind_places(episode) for episode in turns.episodes]
-        seen = (cfg.logged + cfg.own_share, lambda seed: told[seed // 1000 % len(told)])
+        seen = (_BEHIND_PLACES, lambda seed: told[seed // 1000 % len(told)])
         return WordsObjective(model, mixed(lessons.episode, seen), key)
     shares = zip((cfg.logged, cfg.own_share), map(lessons.logged, lesson_folders(pipeline)), strict=False)
     return WordsObjective(model, mixed(lessons.episode, *shares), key)
