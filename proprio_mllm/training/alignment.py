@@ -182,7 +182,8 @@ class AlignmentObjective(Objective):
         self.key = key
         kinds = PHASES[phase].kinds
         self._data, self._cfg = data, cfg
-        self._others = [kind for kind in kinds if kind == "body" or (model.cfg.proprioception and kind not in ("plan", "text"))]
+        feels = model.cfg.proprioception
+        self._others: list[Kind] = [kind for kind in kinds if kind == "body" or (feels and kind not in ("plan", "text"))]
         self._text_share = cfg.text_share if "plan" in kinds else 1.0
 
     def kind(self, rng: np.random.Generator) -> Kind:

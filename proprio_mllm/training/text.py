@@ -96,7 +96,8 @@ def order_places(model: ProprioMLLM, seed: int = 0) -> None:
         model: has been given the rows of a language model that has learnt; theirs is the length of these.
         seed: of the directions.
     """
-    tokens, rows = tokens_of(model.processor.tokenizer), model.core.get_input_embeddings().weight
+    embeddings: Any = model.core.get_input_embeddings()
+    tokens, rows = tokens_of(model.processor.tokenizer), embeddings.weight
     generator = torch.Generator().manual_seed(seed)
     length = rows[tokens.tokens(MARKERS)].norm(dim=1).median()
     for scale in PLACE_SCALES:
