@@ -104,14 +104,20 @@ def pictured_turn(
     codes: Sequence[int] | None,
     answer: Sequence[int] = (),
     read: int = 0,
+    told: slice = slice(0),
 ) -> Example:
-    """`turn_example` with its parts at hand: the view, None for none, and the motion tokens, None for none."""
+    """`turn_example` with its parts at hand: the view, None for none, and the motion tokens, None for none.
+
+    What is `told` of the answer is not learnt.
+    """
     tokens = [*log, *now]
     if view is not None:
         text = IMAGE + (motion_text(codes) if codes is not None else "")
         sight = model.processor.tokenizer(text, add_special_tokens=False)["input_ids"]
         before = len(now) - opening(model.processor.tokenizer)
         tokens = [*log, *now[:before], *sight, *now[before:]]
-    learnt = [False] * len(tokens) + [True] * len(answer)
+    learnt = [True] * len(answer)
+    learnt[told] = [False] * len(answer[told])
+    learnt = [False] * len(tokens) + learnt
     encoded = Encoded(tuple([*tokens, *answer][read:]), tuple(learnt[read:]))
     return Example(views=() if view is None else (view,), tokens=encoded, start=read)

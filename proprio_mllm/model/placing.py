@@ -23,6 +23,11 @@ from proprio_mllm.model.wording import Words, id_words, place_words
 _FOUND: Final = -1.0
 
 
+def finder_of(model: ProprioMLLM) -> NamedPointMap | None:
+    """The point map that tells a model the places in its answers; None where it says them itself, or answers without."""
+    return model.point_map if model.cfg.places and isinstance(model.point_map, NamedPointMap) else None
+
+
 class Placing:
     """Finds things in pictures.
 

@@ -39,9 +39,8 @@ from proprio_mllm.model.building import load_model, load_motion, merge_adapter
 from proprio_mllm.model.chat import Encoded
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.named_map import NamedPointMap
 from proprio_mllm.model.observing import EpisodeLog, turn_example, view_of
-from proprio_mllm.model.placing import Placing, stands_alone
+from proprio_mllm.model.placing import Placing, finder_of, stands_alone
 from proprio_mllm.model.word_tokens import WordTokens, tokens_of
 from proprio_mllm.model.wording import Words, read_step
 from proprio_mllm.planners.answers import AnswerGrammar
@@ -122,8 +121,8 @@ class WordsPlanner:
         self.image_size = model.cfg.image_size if model.cfg.sees else 0
         self._tokenizer = model.processor.tokenizer
         self._collator = Collator(model.processor, model.cfg)
-        knows = model.point_map if model.cfg.places else None
-        self._placing = Placing(model, knows) if isinstance(knows, NamedPointMap) else None
+        finder = finder_of(model)
+        self._placing = None if finder is None else Placing(model, finder)
         self._state: WordsState | None = None
         self._pad = int(self._tokenizer.pad_token_id)
 

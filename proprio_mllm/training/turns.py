@@ -20,6 +20,7 @@ from proprio_mllm.model.batch import Batch, Collator, Example
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.observing import pictured_turn
+from proprio_mllm.model.placing import finder_of
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.sources import Demos
@@ -58,6 +59,9 @@ class Turns:
         self._model, self._demos = model, demos
         self.codes = None if tokens is None else demos.tokens(tokens)
         self._told: dict[int, tuple[list[int], list[int], list[int]]] = {}
+        #: What of an answer the point map says.
+        self._places: dict[int, slice] = {}
+        placed = finder_of(model) is not None
         weights = np.ones(len(demos.motions))
         words = tokens_of(model.processor.tokenizer)
         for start, episode in zip(demos.starts, episodes, strict=True):
@@ -65,6 +69,9 @@ class Turns:
             for number, turn in enumerate(episode.turns):
                 if len(log) <= LONGEST_LOG * words.length:  # as in stage `words`
                     self._told[start + number] = (list(log), words.tokens(turn.now), words.tokens(turn.answer))
+                    if placed and "at" in turn.answer:
+                        ends = (turn.answer[: turn.answer.index(word)] for word in ("at", "do"))
+                        self._places[start + number] = slice(*(len(words.tokens(part)) for part in ends))
                 log += words.tokens(turn.taken)
                 weights[start + number] = _TRIED if turn.tries else 1.0
         rows = np.array(sorted(self._told), dtype=np.int64)
@@ -100,7 +107,8 @@ class Turns:
         """The decision of a row, without the first tokens of its log where they have been read."""
         log, now, answer = self._told[row]
         codes = None if self.codes is None else self.codes[row].tolist()
-        return pictured_turn(self._model, log, now, self._demos.view(self._demos.reader[row]), codes, answer, read)
+        view, told = self._demos.view(self._demos.reader[row]), self._places.get(row, slice(0))
+        return pictured_turn(self._model, log, now, view, codes, answer, read, told)
 
 
 @torch.no_grad()

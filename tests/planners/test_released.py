@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from pathlib import Path
 
@@ -15,10 +16,14 @@ from configs.compose import compose
 from configs.schema.eval import EvalConfig
 from configs.schema.planner import ModelPlanner
 from configs.schema.robot import RobotConfig
+from configs.schema.train import TrainConfig
 from configs.validate import build
+from data.files import read_json
 from interface.observation import Observation
 from proprio_mllm.evaluation.run import evaluate
 from proprio_mllm.evaluation.sessions import open_session
+from proprio_mllm.model.building import build_point_map, load_model
+from proprio_mllm.model.tensors import read_tensors
 from proprio_mllm.planners.protocol import TaskInfo
 from proprio_mllm.planners.random_planner import RandomPlanner
 from proprio_mllm.planners.registry import make_planner
@@ -47,7 +52,19 @@ def first() -> Observation:
 
 
 def test_every_folder_is_known() -> None:
-    assert sorted(path.name for path in WEIGHTS.iterdir()) == sorted((*PARTS, "words"))
+    assert sorted(path.name for path in WEIGHTS.iterdir()) == sorted((*PARTS, "words", "pointmap"))
+
+
+def test_the_point_map_knows_the_words_of_the_released_planner() -> None:
+    about, words = read_json(WEIGHTS / "pointmap" / "config.json"), load_model(WEIGHTS / "words")
+    assert about["words"] == hashlib.sha256(words.table.detach().half().numpy().tobytes()).hexdigest()
+    cfg = build(TrainConfig, compose("train", ["model=tiny"])).model
+    encoder = build_point_map(cfg)
+    assert encoder is not None
+    encoder.load_state_dict(read_tensors(WEIGHTS / "pointmap" / "model.safetensors"))
+    told = json.loads((WEIGHTS / "pointmap" / "provenance.json").read_text())["stages"]
+    assert list(told) == ["words", "practice", "pointmap"]
+    assert told["pointmap"]["metrics"]["names_accuracy"] > 0.9
 
 
 def test_words_alone_plan(first: Observation) -> None:

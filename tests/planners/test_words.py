@@ -187,7 +187,7 @@ def test_the_point_map_says_where_things_are(seeing: WordsPlanner, monkeypatch: 
 
     def goals(found: float) -> list[tuple[str, ...]]:
         monkeypatch.setattr("proprio_mllm.model.placing._FOUND", found)
-        answers = [placed._answer(seen(WordsOnly(seed).shown(), seed), begin(placed, seed)) for seed in range(12)]
+        answers = [placed._answer(seen(WordsOnly(seed).shown(), seed), begin(placed, seed)) for seed in range(36)]
         placed._write(answers)
         return [tuple(one.words[: one.words.index("do")]) for one in answers]
 

@@ -13,13 +13,14 @@ from torch.nn import functional
 from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.building import load_model
 from proprio_mllm.model.named_map import NamedPointMap
-from proprio_mllm.model.placing import Placing, stands_alone
+from proprio_mllm.model.placing import Placing, finder_of, stands_alone
 from proprio_mllm.model.point_map import GeoFeatures, Named
 from proprio_mllm.model.word_tokens import tokens_of
-from proprio_mllm.model.wording import PLACES, WordEpisode, Words, WordTurn, id_words, place_words
+from proprio_mllm.model.wording import PLACE_SCALES, PLACES, WordEpisode, Words, WordTurn, id_words, place_words
 from proprio_mllm.training.pipeline import Pipeline
 from proprio_mllm.training.placing import behind_places, placed, thing_of
 from proprio_mllm.training.sources import Views
+from proprio_mllm.training.stages.alignment import start
 from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, point_map_of, turns_of
 
 
@@ -135,6 +136,25 @@ def test_answers_say_where_their_thing_is(trained: Pipeline, monkeypatch: pytest
         else:
             assert learnt == words.tokens(answers[row])
     assert changed > 0
+
+
+def test_a_model_that_is_told_places_does_not_learn_to_say_them(trained: Pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("proprio_mllm.model.placing._FOUND", -1e9)
+    model = start(trained)
+    model.cfg = dataclasses.replace(model.cfg, places=True)
+    demos, words = lessons_of(trained, model.cfg), tokens_of(model.processor.tokenizer)
+    assert finder_of(model) is model.point_map
+    turns = turns_of(trained, model, demos)
+    scales = {words.tokens([word])[0] for scale in PLACE_SCALES for word in scale}
+    row = next(int(row) for row in turns.train if scales & set(turns.example(int(row)).tokens.ids))
+    told = turns.example(row).tokens
+    learnt = [token for token, by in zip(told.ids, told.targets, strict=True) if by]
+    do, at = (words.tokens([word])[0] for word in ("do", "at"))
+    assert not scales & set(learnt) and at not in learnt
+    assert do in learnt and learnt.index(do) > 0  # the goal before it is, and the step behind it
+    model.cse = model.point_map = None  # as `no_cse`
+    said = turns_of(trained, model, demos).example(row).tokens
+    assert sum(said.targets) == len(learnt) + len(PLACES) and said.ids == told.ids
 
 
 def test_places_need_a_point_map_that_knows_names(trained: Pipeline) -> None:
