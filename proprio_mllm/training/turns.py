@@ -63,8 +63,8 @@ class Turns:
         self._places: dict[int, slice] = {}
         placed = finder_of(model) is not None
         weights = np.ones(len(demos.motions))
-        words = tokens_of(model.processor.tokenizer)
         for start, episode in zip(demos.starts, episodes, strict=True):
+            words = tokens_of(model.processor.tokenizer)  # unknown words are an episode's own
             log = words.tokens(episode.prefix)
             for number, turn in enumerate(episode.turns):
                 if len(log) <= LONGEST_LOG * words.length:  # as in stage `words`

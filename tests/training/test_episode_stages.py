@@ -17,12 +17,13 @@ from proprio_mllm.model.building import build_model, build_processor, load_model
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.word_tokens import WordTokens
+from proprio_mllm.model.wording import WordEpisode, WordTurn
 from proprio_mllm.training.critic import Kept, Trajectory, actor_examples
 from proprio_mllm.training.pipeline import Pipeline, base_model_config
 from proprio_mllm.training.rollouts import read_rollouts
 from proprio_mllm.training.stages import STAGES
 from proprio_mllm.training.stages.inputs import episodes_in_words, lesson_folders, lessons_of, turns_of
-from proprio_mllm.training.turns import TURNS
+from proprio_mllm.training.turns import TURNS, Turns
 from tests.training.conftest import collect, correct
 
 
@@ -52,6 +53,16 @@ def test_a_turn_is_the_decision_of_its_row(trained: Pipeline) -> None:
         learnt = [token for token, target in zip(example.tokens.ids, example.tokens.targets, strict=True) if target]
         assert learnt == words.tokens(turn.answer)
         assert np.array_equal(example.views[0].image, demos.view(demos.reader[int(row)]).image)
+
+
+def test_unknown_words_are_each_episodes_own(trained: Pipeline) -> None:
+    model = load_model(trained.paths.model("base"))
+    demos, words = lessons_of(trained, model.cfg), WordTokens(model.processor.tokenizer)
+    turn = WordTurn(("now", "do"), ("Done", "do", "Done", "."), ())
+    episodes = [WordEpisode((f"zubo{number}", "room"), (turn,)) for number in range(len(demos.starts))]
+    turns = Turns(model, demos, episodes)
+    starts = {turns.example(int(row)).tokens.ids[:2] for row in (*turns.train, *turns.test)}
+    assert starts == {tuple(words.tokens(("zubo", "room")))} and len(episodes) > 2
 
 
 def test_tries_of_an_arm_are_drawn_more_often(trained: Pipeline) -> None:
