@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from proprio_mllm.model.backbone import PUBLISHED
+from proprio_mllm.training.paths import RELEASED_AS
 
 _ABOUT: Final = {
     "practice": "A language model from scratch that plans in words: it reads the episode so far and answers with a plan step.",
@@ -26,8 +27,6 @@ _OWN: Final = "It is of a size for tests on a laptop and not comparable with the
 _OTHERS: Final = "What was added to the base model is here; its weights and their licence are where it is."
 _ALONE: Final = ", and on nothing else: no text or picture of people"
 _ADDED: Final = ", beside what the base model had learnt"
-#: Names of what all variants share.
-_SHARED: Final = {"practice": "words", "base": "base", "pointmap": "pointmap"}
 
 
 def model_card(provenance: Mapping[str, Any]) -> str:
@@ -37,9 +36,9 @@ def model_card(provenance: Mapping[str, Any]) -> str:
         provenance: as in `provenance.json`.
     """
     stage, model = provenance["stage"], provenance["config"]["model"]["name"]
-    variant = "full" if stage in _SHARED else provenance["variant"]
-    planner = _SHARED.get(stage, {"full": "proprio", "no_proprio": "no_proprio"}.get(variant, f"proprio_{variant}"))
-    name = planner if stage in _SHARED else variant
+    variant = "full" if stage in RELEASED_AS else provenance["variant"]
+    planner = RELEASED_AS.get(stage, {"full": "proprio", "no_proprio": "no_proprio"}.get(variant, f"proprio_{variant}"))
+    name = planner if stage in RELEASED_AS else variant
     use = f"eval.py planner={planner} robot=h1" if stage != "pointmap" else "train.py stage=alignment given=weights"
     rows = [
         f"| {one} | {key} | {value:.4g} |"

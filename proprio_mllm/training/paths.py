@@ -14,13 +14,15 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from configs.schema.train import TrainConfig
 from data.files import read_json, write_text
 from data.shards import config_hash
 
 _SHARED = ("words", "practice", "base", "pointmap", "tokenizer")
+#: Names under which what all variants share is released, by the stage that leaves it.
+RELEASED_AS: Final = {"practice": "words", "base": "base", "pointmap": "pointmap"}
 
 
 class StagePaths:

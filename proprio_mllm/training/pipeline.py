@@ -23,7 +23,7 @@ from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.loop import Objective, run_loop
 from proprio_mllm.training.memory import spare_memory
 from proprio_mllm.training.metrics import MetricWriter
-from proprio_mllm.training.paths import StagePaths, finish, finished_key, stage_key
+from proprio_mllm.training.paths import RELEASED_AS, StagePaths, finish, finished_key, stage_key
 from proprio_mllm.training.processes import first_alone, from_first, processes
 from proprio_mllm.training.sources import shard_hash
 
@@ -32,7 +32,12 @@ logger = logging.getLogger(__name__)
 Metrics = dict[str, float]
 
 #: Where released weights hold what a stage trains.
-_GIVEN: Final = {"words": "words", "practice": "words", "pointmap": "pointmap", "tokenizer": "full/motion"}
+_GIVEN: Final = {
+    "words": RELEASED_AS["practice"],
+    "practice": RELEASED_AS["practice"],
+    "pointmap": RELEASED_AS["pointmap"],
+    "tokenizer": "full/motion",
+}
 
 
 class StageError(RuntimeError):

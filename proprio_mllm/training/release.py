@@ -26,21 +26,20 @@ from data.shards import Manifest
 from proprio_mllm.model.building import share_backbone, write_stored
 from proprio_mllm.model.tensors import read_tensors, write_tensors
 from proprio_mllm.training.card import model_card
-from proprio_mllm.training.paths import finished_key
+from proprio_mllm.training.paths import RELEASED_AS, finished_key
 from proprio_mllm.training.pipeline import Pipeline
 from proprio_mllm.training.sources import shard_hash
 from proprio_mllm.training.stages.selu import CRITIC
 
 #: Largest size of one released folder of a model from scratch, megabytes: such are kept with the code.
 LARGEST_MB: Final = 30.0
-#: What all variants share, and all that is released.
-_SHARED: Final = ("practice", "base", "pointmap")
-_RELEASED: Final = (*_SHARED, "alignment", "selu")
+#: All that is released.
+_RELEASED: Final = (*RELEASED_AS, "alignment", "selu")
 
 
 def release_name(stage: str, variant: str) -> str:
     """Name of a released model: `words` is of practice, the last stage's is the variant's."""
-    return {"practice": "words", "base": "base", "pointmap": "pointmap", "selu": variant}.get(stage, f"{variant}-{stage}")
+    return RELEASED_AS.get(stage, variant if stage == "selu" else f"{variant}-{stage}")
 
 
 def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
@@ -73,12 +72,12 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
             continue
         key = pipeline.key(stage)
         target = Path(folder) / pipeline.cfg.model.name / release_name(stage, pipeline.paths.variant)
-        if stage in _SHARED and _released_key(target) == key:  # every variant's export meets them again
+        if stage in RELEASED_AS and _released_key(target) == key:  # every variant's export meets them again
             continue
         with new_folder(target) as work:
             shutil.copytree(source, work, dirs_exist_ok=True)
             _shrink(work)
-            if stage not in _SHARED and (work / "vlm").is_dir():
+            if stage not in RELEASED_AS and (work / "vlm").is_dir():
                 share_backbone(work, target.with_name(release_name("base", "")))
             provenance = _provenance(pipeline, stage, key)
             (work / PROVENANCE).write_text(json.dumps(provenance, indent=1) + "\n", encoding="utf-8")

@@ -41,7 +41,7 @@ def lessons_of(pipeline: Pipeline, model: ModelConfig) -> Demos:
 def episodes_in_words(pipeline: Pipeline, model: ProprioMLLM, key: str, turns: Turns | None = None) -> WordsObjective:
     """Episodes of the text world and of the simulator, in the shares of stage `practice`.
 
-    Of a model whose answers say where things are, the simulator's are those of `turns`, whose places are read.
+    For a model whose answers say where things are, those of the simulator are from `turns`, with places read, and more of them.
     """
     lessons, cfg = pipeline.lessons, pipeline.cfg.practice
     if turns is not None and model.cfg.places:
