@@ -1,7 +1,8 @@
 """Reports on what exists: `python -m proprio_mllm report` lists them.
 
-`compare` sets two planners side by side on the same body, tasks and contingencies, `gap` one planner on two bodies, `write`
-writes a run's `summary.json` and tables again, for example after the run at `difficulty=easy` that its regret needs.
+`compare` sets two planners side by side on the same body, tasks and contingencies, or two ways to train, each by the runs of
+its trainings (RUN,RUN,RUN); `gap` sets one planner on two bodies side by side; `write` writes a run's `summary.json` and tables
+again, for example after the run at `difficulty=easy` that its regret needs.
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from proprio_mllm.report.comparison import RunComparison, compare_bodies, compar
 from proprio_mllm.report.runs import write_report
 from proprio_mllm.report.stored import Run, load_run
 from proprio_mllm.report.table import Table
+from proprio_mllm.report.trainings import compare_trainings
 
 _HERE: Final = "proprio_mllm.report.commands"
 COMMANDS: Final = {
-    "compare": (_HERE, "two planners, in pairs: RUN RUN"),
+    "compare": (_HERE, "two planners, in pairs: RUN RUN; or trainings: RUN,RUN RUN,RUN"),
     "gap": (_HERE, "one planner on two bodies: RUN_H1 RUN_X1"),
     "write": (_HERE, "a run's summary and tables again: RUN"),
     "html": ("proprio_mllm.report.html", "runs as one page with every episode: RUN ..."),
@@ -68,23 +70,33 @@ class PairOptions:
         require(not self.out or Path(self.out).suffix in endings, f"out={self.out}: endings are {', '.join(endings)}")
 
 
-def _text(result: RunComparison, suffix: str) -> str:
-    if suffix == ".json":
-        return json.dumps(result.to_json(), indent=1, ensure_ascii=False) + "\n"
-    return _FORMATS[suffix](comparison_table(result))
+def _text(table: Table, result: RunComparison | None, suffix: str) -> str:
+    if suffix != ".json":
+        return _FORMATS[suffix](table)
+    if result is None:
+        raise ValueError(f"JSON is of two runs; a table of trainings is written as {', '.join(_FORMATS)}")
+    return json.dumps(result.to_json(), indent=1, ensure_ascii=False) + "\n"
 
 
 def _pair(command: str, arguments: Sequence[str]) -> None:
-    (a, b), options = read_named(PairOptions, arguments, ("RUN_A", "RUN_B"))
-    result = _PAIRED[command](load_run(Path(a)), load_run(Path(b)))
+    named, options = read_named(PairOptions, arguments, ("RUN_A", "RUN_B"))
+    firsts, seconds = ([load_run(Path(folder)) for folder in one.split(",")] for one in named)
+    result = None
+    if command == "compare" and (len(firsts) > 1 or len(seconds) > 1):
+        table = compare_trainings(firsts, seconds)
+    elif len(firsts) > 1 or len(seconds) > 1:
+        raise ValueError(f"{command} takes one run a side, got {', '.join(named)}")
+    else:
+        result = _PAIRED[command](firsts[0], seconds[0])
+        table = comparison_table(result)
     if options.out:
         out = Path(options.out)
         out.parent.mkdir(parents=True, exist_ok=True)
-        write_text(out, _text(result, out.suffix))
+        write_text(out, _text(table, result, out.suffix))
     if options.json:
-        sys.stdout.write(_text(result, ".json"))
+        sys.stdout.write(_text(table, result, ".json"))
     else:
-        comparison_table(result).show()
+        table.show()
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -79,19 +79,7 @@ def compare_runs(a: Run, b: Run) -> RunComparison:
         ValueError: when robot, difficulty, start, seed, contingencies or the content of a common task differ, or no episode is
             common; the message names what differs.
     """
-    differing = [
-        f"{name}: {a.metadata[name]!r} and {b.metadata[name]!r}"
-        for name in _SAME_DRAWS
-        if a.metadata.get(name) != b.metadata.get(name)
-    ]
-    hashes = [run.metadata.get("contingencies_hash") for run in (a, b)]
-    if None not in hashes and hashes[0] != hashes[1] and a.metadata["contingencies"] == b.metadata["contingencies"]:
-        differing.append(f"contingencies: the rules of {a.metadata['contingencies']!r} were edited between the runs")
-    if a.metadata["robot"] == b.metadata["robot"] and a.robot_config != b.robot_config:
-        differing.append(f"robot description: {dict(a.robot_config)} and {dict(b.robot_config)}")
-    if a.metadata["robot"] != b.metadata["robot"]:
-        differing.append("two bodies are compared by `python -m proprio_mllm report gap`")
-    return _compared("planners", a, b, differing)
+    return _compared("planners", a, b, _other_draws(a, b))
 
 
 def compare_bodies(a: Run, b: Run) -> RunComparison:
@@ -111,7 +99,30 @@ def compare_bodies(a: Run, b: Run) -> RunComparison:
     return _compared("bodies", a, b, differing)
 
 
-def _compared(kind: str, a: Run, b: Run, differing: list[str]) -> RunComparison:
+def _other_draws(a: Run, b: Run) -> list[str]:
+    """In what two runs on one body differ besides their planner."""
+    differing = [
+        f"{name}: {a.metadata[name]!r} and {b.metadata[name]!r}"
+        for name in _SAME_DRAWS
+        if a.metadata.get(name) != b.metadata.get(name)
+    ]
+    hashes = [run.metadata.get("contingencies_hash") for run in (a, b)]
+    if None not in hashes and hashes[0] != hashes[1] and a.metadata["contingencies"] == b.metadata["contingencies"]:
+        differing.append(f"contingencies: the rules of {a.metadata['contingencies']!r} were edited between the runs")
+    if a.metadata["robot"] == b.metadata["robot"] and a.robot_config != b.robot_config:
+        differing.append(f"robot description: {dict(a.robot_config)} and {dict(b.robot_config)}")
+    if a.metadata["robot"] != b.metadata["robot"]:
+        differing.append("two bodies are compared by `python -m proprio_mllm report gap`")
+    return differing
+
+
+def require_comparable(a: Run, b: Run, differing: Sequence[str] | None = None) -> None:
+    """Refuses runs whose common tasks are not the same, or which differ in what is named (in their luck, when nothing is).
+
+    Raises:
+        ValueError: naming what differs.
+    """
+    differing = list(_other_draws(a, b) if differing is None else differing)
     ours, theirs = a.contents(), b.contents()
     edited = sorted(task for task in ours if theirs.get(task, ours[task]) != ours[task])
     if edited:
@@ -119,13 +130,21 @@ def _compared(kind: str, a: Run, b: Run, differing: list[str]) -> RunComparison:
         differing.append(f"content of the tasks {', '.join(edited[:3])}{more}")
     if differing:
         raise ValueError(f"{a.folder} and {b.folder} cannot be compared: they differ in {'; '.join(differing)}")
+
+
+def in_order(categories: set[str]) -> list[str]:
+    """Categories as every table has them, those of the user's own after them."""
+    return [*(name for name in CATEGORIES if name in categories), *sorted(categories - set(CATEGORIES))]
+
+
+def _compared(kind: str, a: Run, b: Run, differing: Sequence[str]) -> RunComparison:
+    require_comparable(a, b, differing)
     other = {(record.task, record.trial): record for record in b.records}
     pairs = tuple((record, other[record.task, record.trial]) for record in a.records if (record.task, record.trial) in other)
     if not pairs:
         raise ValueError(f"{a.folder} and {b.folder} have no scored episode in common")
     planned = {(task, trial) for run in (a, b) for task, _, trial, _ in run.metadata["planned"]}
-    found = {first.category for first, _ in pairs}
-    order = [*(name for name in CATEGORIES if name in found), *sorted(found - set(CATEGORIES))]
+    order = in_order({first.category for first, _ in pairs})
     rows = {category: _figures([pair for pair in pairs if pair[0].category == category]) for category in order}
     names = tuple(
         {"label": _label(run, than), "robot": str(run.metadata["robot"]), "folder": str(run.folder)}

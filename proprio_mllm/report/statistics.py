@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 _DRAWS = 4000
@@ -136,3 +137,43 @@ def compare(a: Mapping[str, Sequence[float]], b: Mapping[str, Sequence[float]], 
     low, high = cluster_bootstrap([[d] for d in deltas], np.random.default_rng(0), confidence)
     first, second = (float(np.mean([pair[side] for pair in means.values()])) for side in (0, 1))
     return Comparison(len(common), first, second, float(np.mean(deltas)), low, high, p_value, above, below)
+
+
+def trained_interval(
+    first: NDArray[np.floating], second: NDArray[np.floating], confidence: float = 0.95, draws: int = _DRAWS
+) -> tuple[float, float, float]:
+    """The difference of two ways to train, and its percentile interval when trainings and tasks are drawn with replacement.
+
+    Trainings are drawn for each side, tasks for both sides together. A training's share is its sum of counts over its sum of
+    chances; a side's is the mean of its trainings' shares.
+
+    Args:
+        first: (S, T, 2) counts and chances of every training and task.
+        second: (R, T, 2) likewise, of the same tasks.
+        confidence: in (0, 1).
+        draws: number of resamples.
+
+    Returns:
+        Difference (first minus second), lower and upper limit; NaN where a side has no chance at all.
+
+    Raises:
+        ValueError: when the sides are not of the same tasks, or one is empty.
+    """
+    sides = (first, second)
+    if any(side.ndim != 3 or side.shape[2] != 2 or not side.size for side in sides) or first.shape[1] != second.shape[1]:
+        raise ValueError(f"expected (trainings, tasks, 2) of the same tasks, got {first.shape} and {second.shape}")
+    rng = np.random.default_rng(0)
+    tasks = rng.multinomial(first.shape[1], [1 / first.shape[1]] * first.shape[1], draws)
+
+    def shares(side: NDArray[np.floating], times: NDArray[np.integer]) -> NDArray[np.floating]:
+        with np.errstate(invalid="ignore"):
+            return np.divide(*np.moveaxis(np.einsum("nt,stc->nsc", times, side), 2, 0))
+
+    drawn = []
+    for side in sides:
+        picked = rng.integers(len(side), size=(draws, len(side)))
+        drawn.append(np.take_along_axis(shares(side, tasks), picked, axis=1).mean(axis=1))
+    whole = [shares(side, np.ones((1, side.shape[1]), dtype=np.int64)).mean() for side in sides]
+    tail = (1 - confidence) / 2
+    low, high = np.nanquantile(drawn[0] - drawn[1], [tail, 1 - tail]) if np.isfinite(whole).all() else (np.nan, np.nan)
+    return float(whole[0] - whole[1]), float(low), float(high)

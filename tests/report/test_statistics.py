@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from proprio_mllm.report.statistics import cluster_bootstrap, compare, rate_interval, wilson
+from proprio_mllm.report.statistics import cluster_bootstrap, compare, rate_interval, trained_interval, wilson
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 12), (1, 12), (7, 12), (12, 12), (84, 133), (1, 1), (60, 60)])
@@ -91,3 +91,38 @@ def test_paired_comparison() -> None:
     assert compare(a, a).p_value == 1.0
     with pytest.raises(ValueError, match="no common task"):
         compare(a, {"x": [True]})
+
+
+def shares(*trainings: list[float]) -> np.ndarray:
+    """(S, T, 2) of trainings that succeed on these tasks, with one chance each."""
+    return np.stack([np.stack([np.asarray(one), np.ones(len(one))], axis=1) for one in trainings])
+
+
+def test_the_luck_of_trainings_is_in_their_interval() -> None:
+    tasks = 20
+    lucky, never = [1.0] * tasks, [0.0] * tasks
+    assert trained_interval(shares(lucky, never), shares(never, never)) == (0.5, 0.0, 1.0)
+    assert trained_interval(shares(lucky, lucky), shares(never)) == (1.0, 1.0, 1.0)
+
+
+def test_tasks_are_drawn_for_both_sides_together() -> None:
+    hard = [float(i % 2) for i in range(40)]  # what differs between tasks cancels, what differs between sides does not
+    assert trained_interval(shares(hard), shares(hard)) == (0.0, 0.0, 0.0)
+    better = [1.0, *hard[1:]]
+    difference, low, high = trained_interval(shares(better), shares(hard))
+    expected = compare(*({str(i): [one] for i, one in enumerate(side)} for side in (better, hard)))
+    assert difference == pytest.approx(1 / 40)
+    assert (low, high) == pytest.approx((expected.low, expected.high), abs=0.02)
+
+
+def test_a_task_counts_by_its_chances() -> None:
+    many = np.array([[[9.0, 10.0], [0.0, 1.0]]])
+    none = np.array([[[0.0, 10.0], [0.0, 1.0]]])
+    assert trained_interval(many, none)[0] == pytest.approx(9 / 11)
+    assert np.isnan(trained_interval(many * 0, none)).all()
+
+
+@pytest.mark.parametrize("second", [np.zeros((2, 3, 2)), np.zeros((0, 4, 2)), np.zeros((4, 2))])
+def test_other_tasks_have_no_interval(second: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="of the same tasks, got"):
+        trained_interval(np.ones((2, 4, 2)), second)
