@@ -36,7 +36,7 @@ class LoopConfig:
         lr: peak learning rate, reached after `warmup` steps, then a cosine down to a tenth of it.
         warmup: steps of linear warm-up.
         weight_decay: on matrices only.
-        clip: largest gradient norm.
+        clip: largest gradient norm. Below the norm of every kind of batch, all kinds pull alike, whatever their losses.
         checkpoint_every: steps between checkpoints.
         log_every: steps between log lines.
         minutes: time budget over all resumed parts; the schedule then follows whichever of steps and time is further, so

@@ -157,10 +157,10 @@ def run_loop(
     if first:
         logger.info("%s: resumed at step %d of %d", objective.name, first, cfg.steps)
 
-    def make(step: int) -> list[Any]:
+    def make(step: int) -> tuple[Any, list[Any]]:
         streams = [np.random.default_rng([seed, step, number]) for number in range(micro_batches)]
         kind = objective.kind(streams[0] if rank == 0 else np.random.default_rng([seed, step, 0]))
-        return [objective.batch(stream, cfg.batch // micro_batches, kind) for stream in streams[rank::count]]
+        return kind, [objective.batch(stream, cfg.batch // micro_batches, kind) for stream in streams[rank::count]]
 
     began, sums, counted, last = time.monotonic(), dict[str, float](), 0, dict[str, float]()
     module.train()
@@ -168,10 +168,10 @@ def run_loop(
         ThreadPoolExecutor(1) as pool,
         tqdm(total=cfg.steps, initial=first, desc=objective.name, mininterval=5.0, disable=rank > 0) as bar,
     ):
-        ahead: Future[list[Any]] | None = pool.submit(make, first) if first < cfg.steps else None
+        ahead: Future[tuple[Any, list[Any]]] | None = pool.submit(make, first) if first < cfg.steps else None
         for step in range(first, cfg.steps):
             assert ahead is not None
-            batches = ahead.result()
+            kind, batches = ahead.result()
             (seconds,) = from_first([spent + time.monotonic() - began])
             out_of_time = bool(cfg.minutes) and seconds > 60.0 * cfg.minutes
             ahead = pool.submit(make, step + 1) if step + 1 < cfg.steps else None
@@ -201,11 +201,11 @@ def run_loop(
             if not math.isfinite(found["loss"]):
                 raise FloatingPointError(f"{objective.name}: loss {found['loss']} at step {step}; lower lr ({cfg.lr})")
             add_gradients(trained)
-            norm = nn.utils.clip_grad_norm_(trained, cfg.clip)
+            found["grad_norm" if kind is None else f"{kind}_grad_norm"] = float(nn.utils.clip_grad_norm_(trained, cfg.clip))
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
             same_everywhere(module.buffers())  # codes that are learnt without gradients
-            for name, value in {**found, "grad_norm": float(norm)}.items():
+            for name, value in found.items():
                 sums[name] = sums.get(name, 0.0) + value
                 sums[f"#{name}"] = sums.get(f"#{name}", 0.0) + 1.0
             counted += 1

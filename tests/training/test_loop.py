@@ -91,6 +91,36 @@ def test_parts_add_up_to_their_batch(tmp_path: Path) -> None:
     assert float(first[0]["loss"]) == pytest.approx(float(first[1]["loss"]), rel=1e-3)
 
 
+class TwoKinds(Line):
+    """Three of four batches pull a number up, softly; the others pull it down, hard."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.module = nn.Linear(1, 1, bias=False)
+        nn.init.zeros_(self.module.weight)
+
+    def kind(self, rng: np.random.Generator) -> str:
+        return "soft" if rng.random() < 0.75 else "hard"
+
+    def batch(self, rng: np.random.Generator, size: int, kind: str | None = None) -> Tensor:
+        return torch.tensor(-0.2 if kind == "soft" else 50.0)
+
+    def loss(self, module: nn.Module, batch: Tensor, generator: torch.Generator) -> tuple[Tensor, Mapping[str, float]]:
+        return batch * module(torch.ones(1, 1)).sum(), {}
+
+
+@pytest.mark.parametrize(("clip", "up"), [(0.1, True), (10.0, False)])
+def test_kinds_pull_alike_below_a_small_clip(tmp_path: Path, clip: float, up: bool) -> None:
+    cfg = dataclasses.replace(CFG, clip=clip, steps=40)
+    objective = TwoKinds()
+    assert (float(run(tmp_path, objective, cfg)[0]) > 0.0) is up
+    rows = [line.split(",") for line in (tmp_path / "metrics.csv").read_text().splitlines()]
+    found = {name: {row[i] for row in rows[1:]} - {""} for i, name in enumerate(rows[0])}
+    assert "grad_norm" not in found
+    assert [float(value) for value in found["soft_grad_norm"]] == pytest.approx([0.2])
+    assert [float(value) for value in found["hard_grad_norm"]] == pytest.approx([50.0])
+
+
 def test_as_many_batches_are_made_as_steps_are_taken(tmp_path: Path) -> None:
     made: list[int] = []
 
