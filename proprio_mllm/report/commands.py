@@ -81,14 +81,11 @@ def _text(table: Table, result: RunComparison | None, suffix: str) -> str:
 def _pair(command: str, arguments: Sequence[str]) -> None:
     named, options = read_named(PairOptions, arguments, ("RUN_A", "RUN_B"))
     firsts, seconds = ([load_run(Path(folder)) for folder in one.split(",")] for one in named)
-    result = None
-    if command == "compare" and (len(firsts) > 1 or len(seconds) > 1):
-        table = compare_trainings(firsts, seconds)
-    elif len(firsts) > 1 or len(seconds) > 1:
+    several = len(firsts) + len(seconds) > 2
+    if several and command != "compare":
         raise ValueError(f"{command} takes one run a side, got {', '.join(named)}")
-    else:
-        result = _PAIRED[command](firsts[0], seconds[0])
-        table = comparison_table(result)
+    result = None if several else _PAIRED[command](firsts[0], seconds[0])
+    table = compare_trainings(firsts, seconds) if result is None else comparison_table(result)
     if options.out:
         out = Path(options.out)
         out.parent.mkdir(parents=True, exist_ok=True)

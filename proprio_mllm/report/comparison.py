@@ -79,7 +79,7 @@ def compare_runs(a: Run, b: Run) -> RunComparison:
         ValueError: when robot, difficulty, start, seed, contingencies or the content of a common task differ, or no episode is
             common; the message names what differs.
     """
-    return _compared("planners", a, b, _other_draws(a, b))
+    return _compared("planners", a, b, other_draws(a, b))
 
 
 def compare_bodies(a: Run, b: Run) -> RunComparison:
@@ -99,7 +99,7 @@ def compare_bodies(a: Run, b: Run) -> RunComparison:
     return _compared("bodies", a, b, differing)
 
 
-def _other_draws(a: Run, b: Run) -> list[str]:
+def other_draws(a: Run, b: Run) -> list[str]:
     """In what two runs on one body differ besides their planner."""
     differing = [
         f"{name}: {a.metadata[name]!r} and {b.metadata[name]!r}"
@@ -116,18 +116,17 @@ def _other_draws(a: Run, b: Run) -> list[str]:
     return differing
 
 
-def require_comparable(a: Run, b: Run, differing: Sequence[str] | None = None) -> None:
-    """Refuses runs whose common tasks are not the same, or which differ in what is named (in their luck, when nothing is).
+def require_comparable(a: Run, b: Run, differing: Sequence[str]) -> None:
+    """Refuses runs that differ in what is named, or whose common tasks are not the same.
 
     Raises:
         ValueError: naming what differs.
     """
-    differing = list(_other_draws(a, b) if differing is None else differing)
     ours, theirs = a.contents(), b.contents()
     edited = sorted(task for task in ours if theirs.get(task, ours[task]) != ours[task])
     if edited:
         more = f" and {len(edited) - 3} more" if len(edited) > 3 else ""
-        differing.append(f"content of the tasks {', '.join(edited[:3])}{more}")
+        differing = [*differing, f"content of the tasks {', '.join(edited[:3])}{more}"]
     if differing:
         raise ValueError(f"{a.folder} and {b.folder} cannot be compared: they differ in {'; '.join(differing)}")
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from interface.episode import EpisodeRecord, Outcome
 from interface.failures import FailureCategory
-from proprio_mllm.report.comparison import in_order, require_comparable
+from proprio_mllm.report.comparison import in_order, other_draws, require_comparable
 from proprio_mllm.report.metrics import first_tries
 from proprio_mllm.report.statistics import trained_interval
 from proprio_mllm.report.stored import Run
@@ -62,18 +62,21 @@ def compare_trainings(firsts: Sequence[Run], seconds: Sequence[Run]) -> Table:
             if other is not run:
                 raise ValueError(f"{other.folder} and {run.folder} are of the same weights, which is one training")
     for run in every[1:]:
-        require_comparable(first, run)
+        require_comparable(first, run, other_draws(first, run))
     tasks = sorted(set.intersection(*({record.task for record in run.records} for run in every)))
     if not tasks:
         raise ValueError(f"{', '.join(str(run.folder) for run in every)} have no scored task in common")
     category = {record.task: record.category for record in first.records}
     labels = [str(side[0].metadata["label"]) for side in (firsts, seconds)]
+    counts = {
+        figure: [np.stack([_by_task(run, tasks, of) for run in side]) for side in (firsts, seconds)]
+        for figure, of in _SHARES.items()
+    }
     body: list[tuple[str, ...]] = []
     for name in (*in_order({category[task] for task in tasks}), "all"):
-        chosen = [task for task in tasks if name in ("all", category[task])]
-        for figure, of in _SHARES.items():
-            sides = [np.stack([_by_task(run, chosen, of) for run in side]) for side in (firsts, seconds)]
-            body.append((name, figure, str(len(chosen)), *_cells(*sides)))
+        chosen = [number for number, task in enumerate(tasks) if name in ("all", category[task])]
+        for figure, sides in counts.items():
+            body.append((name, figure, str(len(chosen)), *_cells(*(side[:, chosen] for side in sides))))
     columns = ("category", "share", "tasks", *(f"{label} %" for label in labels), "difference", "95 % interval")
     notes = (
         f"{len(firsts)} and {len(seconds)} trainings, in the order of their runs; difference: mean of the first minus mean of "
