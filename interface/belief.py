@@ -37,6 +37,8 @@ _NEVER: Final = (
     FailureCode.NOT_USABLE,
     FailureCode.NOT_FILLABLE,
 )
+#: Walks to one thing after which an arm has to try something before the next: where no stance helps, none of them tells why.
+ENOUGH_WALKS: Final = 3
 #: Kinds of goals that are met for good, as states.
 _DONE: Final = {
     "sliced": (Condition.SLICED, True),
@@ -66,6 +68,7 @@ class Belief:
         never: (verb, id) that will never work, and why.
         fails: failures of (verb, id) since the last arm action that succeeded.
         stances: walks to an object since then.
+        untried: walks that reached an object since an arm last tried anything.
         heights: changes of pelvis height at the present stance, metres, upwards positive.
         at_limit: directions in which the legs are at their end.
         lowered_m: how much lower the pelvis is than at the start, as far as it was asked to.
@@ -86,6 +89,7 @@ class Belief:
     never: dict[tuple[str, str], FailureCode] = field(default_factory=dict)
     fails: dict[tuple[str, str], list[Event]] = field(default_factory=dict)
     stances: dict[str, int] = field(default_factory=dict)
+    untried: dict[str, int] = field(default_factory=dict)
     heights: list[float] = field(default_factory=list)
     at_limit: set[bool] = field(default_factory=set)
     lowered_m: float = 0.0
@@ -116,6 +120,10 @@ class Belief:
     def failed(self) -> Event | None:
         """What went wrong in the newest step, None when nothing did."""
         return next((event for event in self.last if not event.ok), None)
+
+    def walked_enough(self) -> bool:
+        """Whether walks alone have not helped where the robot stands."""
+        return self.untried.get(self.state.here or "", 0) >= ENOUGH_WALKS
 
     def holds_furniture(self) -> Arm | None:
         """The arm that holds a door open."""
@@ -168,6 +176,8 @@ class Belief:
 
     def _take(self, event: Event) -> None:
         action, target = event.action, event.action.object_id or ""
+        if action.spec.arms:
+            self.untried.clear()
         if action.spec.has_effect(Walk, Turn):
             if action.object_id is not None:
                 self.stances[target] = self.stances.get(target, 0) + 1
@@ -197,6 +207,7 @@ class Belief:
         self.state.succeed(action)
         if action.spec.has_effect(Walk, Turn) and action.object_id is not None:
             self.visited.add(target)
+            self.untried[target] = self.untried.get(target, 0) + 1
             self.blocked = 0
         if action.spec.kind is ActionKind.BODY or not action.spec.effects:
             return

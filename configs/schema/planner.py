@@ -59,8 +59,8 @@ class ModelPlanner(PlannerConfig):
         train: command that makes the weights, for the message when they are absent.
         temperature: 0 takes the most likely token.
         insist: whether it may take steps that are bound to be refused by what its log tells of hands and states, look for
-            something where it has been, end the task with a step that did nothing, and take a third time what was refused
-            twice.
+            something where it has been or nothing lies, walk to a thing a fourth time with no arm having tried it, end the
+            task with a step that did nothing, and take a third time what was refused twice.
         blind: hides the picture, the robot's own body, or both (`proprio_mllm.evaluation.showing`).
         reflection: whether failures are reflected on: a stored model says of what type they are and what changes before it
             plans; planners that ask a backend ask once more for cause, change and new steps.

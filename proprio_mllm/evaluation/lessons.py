@@ -5,7 +5,8 @@ so a model that sees the same can learn it. Part of the steps that are taken are
 from them is what is learnt. Episodes are made in the text world, or read from logs of the simulator, which are told in the same
 words. In half of the episodes some object types bear made-up names, in the instruction and in their ids,
 so that things are named by reading and not by heart. Half of the episodes reflect on every failure, the others on none. In
-some the log tells failures as one bit, to teacher and learner alike.
+some the log tells failures as one bit, to teacher and learner alike. A teacher that foresees reach walks past every stance from
+which an arm cannot reach; who cannot would learn to walk to and fro, so the fourth walk to what no arm has tried is not learnt.
 
 This is the bridge that `train.py` wires: training asks for the episode of a seed and knows neither worlds nor planners.
 """
@@ -26,6 +27,7 @@ from configs.schema.collect import TRAIN_ROOMS
 from data.shards import ShardReader
 from interface.actions import ACTIONS
 from interface.bodies import PAPER_ROBOTS
+from interface.effects import Walk
 from interface.failures import FAILURES
 from interface.observation import HistoryItem
 from interface.sightings import Shown, Sightings
@@ -246,8 +248,10 @@ class _Record:
         actions = tuple(
             one if one.object_id is None else replace(one, object_id=self._id(one.object_id)) for one in step.actions
         )
-        reflection = reflection_words(self._sightings.belief.failed, PlanStep(actions)) if self._reflects else ()
-        answer = answer_words(verb, self._id(target) if target else target, PlanStep(actions), reflection)
+        belief, answer = self._sightings.belief, tuple[str, ...]()
+        if not (belief.walked_enough() and any(one.spec.has_effect(Walk) for one in actions)):
+            reflection = reflection_words(belief.failed, PlanStep(actions)) if self._reflects else ()
+            answer = answer_words(verb, self._id(target) if target else target, PlanStep(actions), reflection)
         self._turns.append(WordTurn(state_words(self._sightings, self._reflects), answer, (), tries))
 
     def episode(self) -> WordEpisode:

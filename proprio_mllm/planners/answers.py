@@ -30,8 +30,8 @@ class AnswerGrammar:
     Args:
         ids: known ids.
         belief: what is known of the world; left out are actions that are bound to be refused by it, walks in search of
-            something to where it was looked for, and the end of the task unless hands have just done something. None leaves
-            out none.
+            something to where it is not or was looked for, walks where walks alone have not helped, and the end of the task
+            unless hands have just done something. None leaves out none.
         reflects: whether an answer begins with a reflection.
         places: whether it may say where its thing is.
         place: tells where that is, so that it is said whenever it is told; None leaves it to who answers.
@@ -49,8 +49,7 @@ class AnswerGrammar:
         self._belief, self._reflection, self._places, self._place = belief, _REFLECTION if reflects else (), places, place
         #: Words of the reflection.
         self.reflected = len(self._reflection)
-        spots = [name for name in ids if type_of(name) in (*SURFACES, *SEATS, *CONTAINERS)]
-        self._searched = frozenset() if belief is None else _searched(spots, belief)
+        self._searched = frozenset() if belief is None else _searched(ids, belief)
 
     def allowed(self, words: Sequence[str]) -> list[str]:
         """The words that may follow some words of an answer; none after its end."""
@@ -130,12 +129,13 @@ class AnswerGrammar:
                 continue
             if name in skipped and spec.has_effect(Walk):
                 continue
-            if self._belief is None or (self._belief.refusal(action) is None and self._may_come_now(spec)):
+            if self._belief is None or self._may_come_now(action, self._belief):
                 yield words
 
-    def _may_come_now(self, spec: ActionSpec) -> bool:
-        assert self._belief is not None
-        return spec.kind is not ActionKind.EPISODE or any(event.ok and event.action.spec.arms for event in self._belief.last)
+    def _may_come_now(self, action: Action, belief: Belief) -> bool:
+        if action.spec.kind is ActionKind.EPISODE and not any(event.ok and event.action.spec.arms for event in belief.last):
+            return False
+        return belief.refusal(action) is None and not (action.spec.has_effect(Walk) and belief.walked_enough())
 
     def _may_be_wanted(self, spec: ActionSpec, name: str) -> bool:
         """Whether an object is one for a verb, whatever the hands do now: furniture is not picked, nor what is held."""
@@ -157,11 +157,16 @@ def _next(begun: Sequence[str], ids: Iterator[tuple[str, ...]]) -> list[str]:
     return list(dict.fromkeys(words[size] for words in ids if words[:size] == tuple(begun)))
 
 
-def _searched(places: Sequence[str], belief: Belief) -> frozenset[str]:
-    """The places to which one need not go to look for something: none once all have been visited."""
-    seen = {name for name in places if name in belief.visited}
-    closed = {name for name in seen if type_of(name) in CONTAINERS and belief.state.is_in(Condition.OPEN, name) is not True}
-    return frozenset(seen - closed if len(seen) < len(places) else ())
+def _searched(ids: Sequence[str], belief: Belief) -> frozenset[str]:
+    """Where one need not go to look for something: what nothing lies in, what was looked through while some was not."""
+    spots = {name for name in ids if type_of(name) in (*SURFACES, *SEATS, *CONTAINERS)}
+    left = {name for name in spots if not _looked_through(name, belief)}
+    return frozenset(set(ids) - (left or spots))
+
+
+def _looked_through(name: str, belief: Belief) -> bool:
+    """Whether it was gone to, and is not shut."""
+    return name in belief.visited and (type_of(name) not in CONTAINERS or belief.state.is_in(Condition.OPEN, name) is True)
 
 
 @functools.cache

@@ -13,6 +13,8 @@ import pytest
 from configs.schema.collect import CollectConfig
 from data.shards import ShardReader
 from interface.failures import FailureCode
+from interface.observation import HistoryItem
+from interface.sightings import Shown
 from interface.steps import PlanStep
 from proprio_mllm.evaluation import lessons
 from proprio_mllm.evaluation.dagger import collect_lessons
@@ -91,8 +93,9 @@ def test_what_was_foreseen_is_the_answer_with_a_picture_and_never_in_words_alone
     targets = reader.column("target")
     turns = [turn for episode in Lessons().told(tmp_path) for turn in episode.turns]
     assert [turn.tries for turn in turns] == [any(one.spec.arms for one in PlanStep.parse(text).actions) for text in taught]
-    told = [_step(turn.answer) for turn in turns]
-    assert told == [_step(answer_words("Pick", "", PlanStep.parse(target))) for target in targets]
+    learnt = [(turn.answer, target) for turn, target in zip(turns, targets, strict=True) if turn.answer]
+    assert len(learnt) > 0.8 * len(turns)
+    assert all(_step(answer) == _step(answer_words("Pick", "", PlanStep.parse(target))) for answer, target in learnt)
     assert (targets != taught) == ahead
     assert reader.manifest.metadata["physics"] == PHYSICS
     alone = [_step(turn.answer) for turn in Lessons().logged(tmp_path)(-1).turns]
@@ -101,6 +104,15 @@ def test_what_was_foreseen_is_the_answer_with_a_picture_and_never_in_words_alone
 
 def _step(answer: Sequence[str]) -> tuple[str, ...]:
     return tuple(answer[list(answer).index("do") + 1 :])
+
+
+def test_a_fourth_walk_to_what_no_arm_has_tried_is_not_learnt() -> None:
+    walk, pick = PlanStep.parse("GoTo(Mug_1, 0.5)"), PlanStep.parse("Pick(left, Mug_1)")
+    log = [HistoryItem(walk.to_text(), f"{walk.to_text()} ok")] * 4
+    looks = [Shown("Pick up the mug.", "h1", ("Mug_1",), ("DiningTable_1", "Mug_1"), tuple(log[:count])) for count in range(5)]
+    told = lessons._of_log(looks, False, {}, False, [walk, walk, walk, walk, pick])
+    assert [bool(turn.answer) for turn in told.turns] == [True, True, True, False, True]
+    assert all(turn.taken for turn in told.turns[:-1])  # it stays in the log
 
 
 def test_half_of_the_episodes_reflect_on_every_failure() -> None:

@@ -114,8 +114,21 @@ def test_what_is_not_seen_is_looked_for_where_one_has_not_been() -> None:
     assert "fridge" in grammar.allowed(search)  # it has not been opened
     assert grammar.allowed([*fetch, "dining", "table"]) == ["_1", "_2"]
     assert AnswerGrammar(IDS).allowed([*search, "dining", "table"]) == ["_1", "_2"]
-    everywhere = Belief.of([HistoryItem(f"GoTo({name})", f"GoTo({name}) ok") for name in IDS])
-    assert AnswerGrammar(IDS, everywhere).allowed([*search, "dining", "table"]) == ["_1", "_2"]
+    everywhere = [HistoryItem(f"GoTo({name})", f"GoTo({name}) ok") for name in IDS]
+    assert AnswerGrammar(IDS, Belief.of(everywhere)).allowed(search) == ["fridge"]
+    opened = [
+        *everywhere,
+        HistoryItem("Open(left, Fridge_1)", "Open(left, Fridge_1) ok"),
+        HistoryItem("Release(left)", "Release(left) ok"),
+    ]
+    assert AnswerGrammar(IDS, Belief.of(opened)).allowed(search) == ["dining", "tv", "fridge"]  # never what nothing lies in
+
+
+def test_an_arm_tries_before_a_fourth_walk_to_one_thing() -> None:
+    walks = [HistoryItem("GoTo(Mug_1)", f"GoTo(Mug_1) {code}") for code in ("ok", "BlockedPath", "ok", "ok")]
+    tried = HistoryItem("Pick(left, Mug_1)", "Pick(left, Mug_1) TooFar")
+    for log, walks_on in ((walks[:-1], True), (walks, False), ([*walks, tried], True)):
+        assert ("GoTo" in AnswerGrammar(IDS, Belief.of(log)).allowed(["Pick", "mug", "_1", "do"])) is walks_on
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ class AlignmentStage:
     name = "alignment"
     needs = ("base", "practice", "pointmap", "tokenizer")
     shards = ("lessons",)
-    recipe = 18
+    recipe = 19
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The phases and the variant's model."""
