@@ -153,6 +153,8 @@ class AlignmentConfig:
         judge_share: share of judging questions among the decisions.
         questions: body-relative questions packed per image.
         mask: share of motion tokens hidden in masked motion.
+        go_back: how far the language model's layers are taken back at the end to what they were before stage `base`, or before
+            this one where they were pretrained; a share (`proprio_mllm.model.building.go_back`).
     """
 
     text: LoopConfig
@@ -163,9 +165,10 @@ class AlignmentConfig:
     judge_share: float = 0.15
     questions: int = 6
     mask: float = 0.3
+    go_back: float = 0.0
 
     def __post_init__(self) -> None:
-        _require_shares(self, "plan_share", "text_share", "judge_share", "mask")
+        _require_shares(self, "plan_share", "text_share", "judge_share", "mask", "go_back")
         require(self.questions > 0, f"questions {self.questions} must be positive")
 
 

@@ -209,6 +209,27 @@ def merge_adapter(model: ProprioMLLM) -> None:
     model.vlm = vlm
 
 
+def go_back(model: ProprioMLLM, before: ProprioMLLM | None, share: float) -> None:
+    """Takes the layers of the language model, adapters included, part of the way back to what they were before they saw.
+
+    What was learnt since stays mostly, and less of what was known is lost (Wortsman et al., 2022).
+
+    Args:
+        model: the model; its rows, vision and heads stay.
+        before: a model of the same layers without adapters; None when the layers have only learnt through adapters.
+        share: how far, between 0 and 1.
+    """
+    known = {} if before is None else dict(before.core.named_parameters())
+    with torch.no_grad():
+        for name, weights in model.core.named_parameters():
+            if "language_model." not in name or "embed_tokens" in name:
+                continue
+            if ".lora_B." in name:
+                weights.mul_(1.0 - share)
+            elif ".lora_" not in name and known:
+                weights.lerp_(known[name.replace(".base_layer", "")].to(weights), share)
+
+
 def use_adapter(model: ProprioMLLM, name: str) -> None:
     """Makes an adapter the active one.
 

@@ -1,3 +1,4 @@
+import copy
 import dataclasses
 import json
 
@@ -138,6 +139,31 @@ def test_an_adapter_can_start_from_another_and_merging_keeps_the_function(cfg, b
     torch.testing.assert_close(_logits(model, batch), first, atol=1e-4, rtol=1e-4)
     assert not any(adapter_of(name) for name, _ in model.named_parameters())
     assert parameter_groups(model)["lm"]
+
+
+@pytest.mark.parametrize("pretrained", [True, False])
+def test_going_back_is_half_way_between_what_was_and_what_was_learnt(pretrained, cfg, build, shake):
+    before, model = build(cfg)[0], build(cfg)[0]
+    if not pretrained:  # otherwise only the adapter has learnt
+        torch.manual_seed(0)
+        with torch.no_grad():
+            for weights in model.parameters():
+                weights.add_(0.1 * torch.randn_like(weights))
+    building.add_adapter(model)
+    shake(model)
+
+    def merged(one):
+        one = copy.deepcopy(one)
+        building.merge_adapter(one)
+        return dict(one.core.named_parameters())
+
+    learnt, was, moved = merged(model), dict(before.core.named_parameters()), 0
+    building.go_back(model, None if pretrained else before, 0.25)
+    for name, weights in merged(model).items():
+        layers = "language_model." in name and "embed_tokens" not in name
+        torch.testing.assert_close(weights, torch.lerp(learnt[name], was[name], 0.25) if layers else learnt[name])
+        moved += layers and not torch.equal(weights, learnt[name])
+    assert moved > 5
 
 
 def test_unknown_and_empty_groups_are_refused(cfg, build):

@@ -11,6 +11,7 @@ from proprio_mllm.model.building import (
     add_adapter,
     build_model,
     build_processor,
+    go_back,
     load_model,
 )
 from proprio_mllm.model.groups import train_only
@@ -53,6 +54,9 @@ class AlignmentStage:
             train_only(model, about.groups)
             objective = AlignmentObjective(model, data, phase, pipeline.cfg.alignment, f"{key}/{phase}")
             pipeline.loop(objective, getattr(pipeline.cfg.alignment, phase), folder / phase)
+        if share := pipeline.cfg.alignment.go_back:
+            before = load_model(pipeline.paths.model("practice")) if model.cfg.weights is None else None
+            go_back(model, before, share)
         pipeline.store("alignment", model, read)
         asked = grounding_accuracy(model, views, asked_by(model.cfg), tokens=read)
         felt = {} if turns.codes is None else body_state_accuracy(model, demos, turns.codes)
