@@ -261,8 +261,9 @@ class TrainConfig:
         footprint: prints what alignment costs, on GPUs that reach so many TFLOP/s each, and trains nothing; None trains.
         overwrite: run a stage from its start although its output is current, or a checkpoint is there.
         release: folder the finished stages are exported to, None for no export.
-        given: folder of released weights, such as `weights`: the language model of words and practice, the point map and the
-            motion tokenizer are taken from there, where it has them, in place of being trained. None trains everything.
+        given: folder of released weights, such as `weights`: the language model of words and practice, the base model, the
+            point map and the motion tokenizer are taken from there, where it has them, in place of being trained. None trains
+            everything.
         resume: continue an interrupted stage from its checkpoint.
         data: where motions come from, and what is kept of them.
         collect: what the simulator writes before training.

@@ -35,6 +35,7 @@ Metrics = dict[str, float]
 _GIVEN: Final = {
     "words": RELEASED_AS["practice"],
     "practice": RELEASED_AS["practice"],
+    "base": RELEASED_AS["base"],
     "pointmap": RELEASED_AS["pointmap"],
     "tokenizer": "full/motion",
 }

@@ -36,10 +36,6 @@ WEIGHTS = Path(__file__).parents[2] / "weights" / "tiny"
 PARTS = {
     "base": ("mrope", False, False),
     "full": ("rope_sign", True, True),
-    "no_mpe": ("mrope", True, True),
-    "no_cse": ("rope_sign", False, True),
-    "no_mpe_cse": ("mrope", False, True),
-    "no_proprio": ("mrope", False, False),
 }
 EPISODES = ["words", "practice", "base", "pointmap", "tokenizer", "alignment"]
 

@@ -320,7 +320,7 @@ def test_released_parts_are_taken_and_not_trained(trained: Pipeline, tmp_path: P
     cfg = dataclasses.replace(trained.cfg, output=str(tmp_path / "run"), given=str(tmp_path / "weights"))
     pipeline = Pipeline(STAGES, cfg, collect, "", correct, Lessons())
     monkeypatch.setattr(pipeline, "loop", _stopped)
-    for stage in ("words", "practice", "pointmap", "tokenizer"):
+    for stage in ("words", "practice", "base", "pointmap", "tokenizer"):
         assert pipeline.key(stage) != trained.key(stage)
         assert pipeline.run(stage) is not None and pipeline.is_current(stage)
     ours, theirs = (load_model(one.paths.model("practice")).state_dict() for one in (pipeline, trained))
@@ -331,7 +331,7 @@ def test_released_parts_are_taken_and_not_trained(trained: Pipeline, tmp_path: P
         for name, tensor in theirs.items():
             torch.testing.assert_close(ours[name], tensor, atol=1e-3, rtol=1e-3)
     with pytest.raises(KeyboardInterrupt):
-        pipeline.run("base")  # is trained
+        pipeline.run("alignment")  # is trained
     assert release.export(pipeline, tmp_path / "weights") == [], "what was taken from there keeps its provenance"
 
     wider = dataclasses.replace(cfg.model, text=dataclasses.replace(cfg.model.text, hidden=128))
@@ -339,6 +339,10 @@ def test_released_parts_are_taken_and_not_trained(trained: Pipeline, tmp_path: P
     for model, stage in ((wider, "words"), (longer, "tokenizer")):
         with pytest.raises(StageError, match=r"given=.* is of .*, the configuration asks for"):
             Pipeline(STAGES, dataclasses.replace(cfg, model=model), collect, "", correct, Lessons()).run(stage)
+    unheard = Pipeline(STAGES, dataclasses.replace(cfg, overwrite=True), collect, "", correct, Lessons())
+    monkeypatch.setattr(unheard.lessons, "words", lambda: ("zebra",))
+    with pytest.raises(StageError, match=r"tiny/base is of .*without \['zebra'\]"):
+        unheard.run("base")
     words = tmp_path / "weights" / "tiny" / "words"  # become others than the point map has learnt
     file = words / "vlm" / "model.safetensors"
     save_file({name: 1.5 * tensor for name, tensor in load_file(file).items()}, file, {"format": "pt"})

@@ -7,14 +7,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from configs.schema.model import ModelConfig
 from proprio_mllm.model.building import build_model, build_processor, load_model
 from proprio_mllm.model.dense import DenseHead
 from proprio_mllm.model.groups import train_only
-from proprio_mllm.model.word_tokens import add_word_tokens, tokens_of
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.word_tokens import add_word_tokens, known_words, tokens_of
 from proprio_mllm.model.wording import name_words
 from proprio_mllm.training.base import DenseObjective, JointObjective, grounding_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config, seeded
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views
 from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
 from proprio_mllm.training.text import adopt, corpus, order_places, start_from_words, whole_words
 from proprio_mllm.training.turns import turn_accuracy
@@ -36,30 +38,43 @@ class BaseStage:
         return {"base": dataclasses.asdict(pipeline.cfg.base), "model": plain}
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
-        """Trains and stores the base model; nothing to do where pretrained weights are given."""
+        """Trains and stores the base model, and measures it; nothing to do where pretrained weights are given."""
         if pipeline.needs_no(self.name):
             return {}
-        cfg, lessons = pipeline.cfg, pipeline.lessons
-        plain = dataclasses.replace(base_model_config(cfg.model), sees=True)
+        plain = dataclasses.replace(base_model_config(pipeline.cfg.model), sees=True)
         views, clips = Views(pipeline.paths.shards("views"), plain), Clips(pipeline.paths.shards("clips"))
         demos = lessons_of(pipeline, plain)
-        processor = build_processor(plain, corpus(plain, views, clips, cfg.seed), whole_words(views))
-        add_word_tokens(processor.tokenizer, lessons.words())
-        model = build_model(plain, processor, cfg.seed)
-        adopt(model, load_model(pipeline.paths.model("practice")))
-        start_from_words(model, views.type_names)
-        order_places(model, cfg.seed)
-        words = tokens_of(processor.tokenizer)
-        head = seeded(lambda: DenseHead([words.tokens(name_words(name)) for name in views.type_names]), cfg.seed)
-        dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
-        chosen = {id(p) for p in train_only(model, ("vision", "merger"))} | {id(p) for p in head.parameters()}
-        for parameter in dense.module.parameters():
-            parameter.requires_grad_(id(parameter) in chosen)
-        pipeline.loop(dense, cfg.base.dense, folder / "dense")
-        model.requires_grad_(True)
-        turns, episodes = turns_of(pipeline, model, demos), episodes_in_words(pipeline, model, f"{key}/words")
-        joint = JointObjective(model, head, views, turns, demos, clips, episodes, cfg.base, f"{key}/joint")
-        pipeline.loop(joint, cfg.base.joint, folder / "joint")
+        if (given := pipeline.given(self.name)) is not None:
+            model = load_model(given)
+            unknown = set(pipeline.lessons.words()) - set(known_words(model.processor.tokenizer))
+            pipeline.fits(given, (model.cfg, f"without {sorted(unknown)[:3]}"), (plain, "without []"))
+        else:
+            model = _trained(pipeline, folder, key, plain, views, clips, demos)
         pipeline.store("base", model)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE))
-        return {**asked, **turn_accuracy(model, turns), **held_out_metrics(model, {"": lessons.episode})}
+        planned = turn_accuracy(model, turns_of(pipeline, model, demos))
+        return {**asked, **planned, **held_out_metrics(model, {"": pipeline.lessons.episode})}
+
+
+def _trained(
+    pipeline: Pipeline, folder: Path, key: str, plain: ModelConfig, views: Views, clips: Clips, demos: Demos
+) -> ProprioMLLM:
+    cfg, lessons = pipeline.cfg, pipeline.lessons
+    processor = build_processor(plain, corpus(plain, views, clips, cfg.seed), whole_words(views))
+    add_word_tokens(processor.tokenizer, lessons.words())
+    model = build_model(plain, processor, cfg.seed)
+    adopt(model, load_model(pipeline.paths.model("practice")))
+    start_from_words(model, views.type_names)
+    order_places(model, cfg.seed)
+    words = tokens_of(processor.tokenizer)
+    head = seeded(lambda: DenseHead([words.tokens(name_words(name)) for name in views.type_names]), cfg.seed)
+    dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
+    chosen = {id(p) for p in train_only(model, ("vision", "merger"))} | {id(p) for p in head.parameters()}
+    for parameter in dense.module.parameters():
+        parameter.requires_grad_(id(parameter) in chosen)
+    pipeline.loop(dense, cfg.base.dense, folder / "dense")
+    model.requires_grad_(True)
+    turns, episodes = turns_of(pipeline, model, demos), episodes_in_words(pipeline, model, f"{key}/words")
+    joint = JointObjective(model, head, views, turns, demos, clips, episodes, cfg.base, f"{key}/joint")
+    pipeline.loop(joint, cfg.base.joint, folder / "joint")
+    return model
