@@ -20,7 +20,7 @@ def test_every_table_says_what_it_needs(table: str, tmp_path: Path, capsys: pyte
     printed = capsys.readouterr().out.splitlines()
     assert len(printed) == len(wanted) + 1
     runs = sum(not one.why_not for one in wanted)
-    assert printed[-1].startswith(f"{runs} runs, about ") and runs >= 6
+    assert printed[-1].startswith(f"{runs} runs, about ") and runs >= 2
 
 
 def test_what_needs_an_api_is_named_and_left_out() -> None:

@@ -50,7 +50,7 @@ def test_models_that_share_a_backbone_are_sent_together(hub: Hub, capsys: pytest
     card = hub.files.pop("README.md").decode()
     assert hub.files == kept
     assert ModelCard(card).data.to_dict()["library_name"] == "proprio-mllm"
-    assert all(f"| [`{name}`]({name}/README.md) |" in card for name in ("base", "full", "no_cse", "words"))
+    assert all(f"| [`{name}`]({name}/README.md) |" in card for name in ("base", "full", "words"))
 
 
 def test_one_model_is_sent_with_its_own_card(hub: Hub) -> None:
