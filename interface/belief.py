@@ -121,9 +121,9 @@ class Belief:
         """What went wrong in the newest step, None when nothing did."""
         return next((event for event in self.last if not event.ok), None)
 
-    def walked_enough(self) -> bool:
-        """Whether walks alone have not helped where the robot stands."""
-        return self.untried.get(self.state.here or "", 0) >= ENOUGH_WALKS
+    def walked_enough(self, action: Action) -> bool:
+        """Whether an action walks on where walks alone have not helped."""
+        return action.spec.has_effect(Walk) and self.untried.get(self.state.here or "", 0) >= ENOUGH_WALKS
 
     def holds_furniture(self) -> Arm | None:
         """The arm that holds a door open."""

@@ -27,7 +27,6 @@ from configs.schema.collect import TRAIN_ROOMS
 from data.shards import ShardReader
 from interface.actions import ACTIONS
 from interface.bodies import PAPER_ROBOTS
-from interface.effects import Walk
 from interface.failures import FAILURES
 from interface.observation import HistoryItem
 from interface.sightings import Shown, Sightings
@@ -249,7 +248,7 @@ class _Record:
             one if one.object_id is None else replace(one, object_id=self._id(one.object_id)) for one in step.actions
         )
         belief, answer = self._sightings.belief, tuple[str, ...]()
-        if not (belief.walked_enough() and any(one.spec.has_effect(Walk) for one in actions)):
+        if not any(map(belief.walked_enough, actions)):
             reflection = reflection_words(belief.failed, PlanStep(actions)) if self._reflects else ()
             answer = answer_words(verb, self._id(target) if target else target, PlanStep(actions), reflection)
         self._turns.append(WordTurn(state_words(self._sightings, self._reflects), answer, (), tries))

@@ -35,7 +35,7 @@ from configs.schema.model import ModelConfig
 from configs.validate import build
 from data.files import file_hash, new_folder, read_json
 from proprio_mllm.model.backbone import PatchEmbedding, backbone_config
-from proprio_mllm.model.groups import adapter_of
+from proprio_mllm.model.groups import adapter_of, group_of
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.named_map import NamedPointMap
@@ -222,11 +222,9 @@ def go_back(model: ProprioMLLM, before: ProprioMLLM | None, share: float) -> Non
     known = {} if before is None else dict(before.core.named_parameters())
     with torch.no_grad():
         for name, weights in model.core.named_parameters():
-            if "language_model." not in name or "embed_tokens" in name:
-                continue
             if ".lora_B." in name:
                 weights.mul_(1.0 - share)
-            elif ".lora_" not in name and known:
+            elif known and group_of(name) == "lm":
                 weights.lerp_(known[name.replace(".base_layer", "")].to(weights), share)
 
 

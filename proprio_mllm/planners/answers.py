@@ -135,7 +135,7 @@ class AnswerGrammar:
     def _may_come_now(self, action: Action, belief: Belief) -> bool:
         if action.spec.kind is ActionKind.EPISODE and not any(event.ok and event.action.spec.arms for event in belief.last):
             return False
-        return belief.refusal(action) is None and not (action.spec.has_effect(Walk) and belief.walked_enough())
+        return belief.refusal(action) is None and not belief.walked_enough(action)
 
     def _may_be_wanted(self, spec: ActionSpec, name: str) -> bool:
         """Whether an object is one for a verb, whatever the hands do now: furniture is not picked, nor what is held."""

@@ -142,7 +142,7 @@ def test_an_adapter_can_start_from_another_and_merging_keeps_the_function(cfg, b
 
 
 @pytest.mark.parametrize("pretrained", [True, False])
-def test_going_back_is_half_way_between_what_was_and_what_was_learnt(pretrained, cfg, build, shake):
+def test_going_back_is_part_of_the_way_from_what_was_learnt_to_what_was(pretrained, cfg, build, shake):
     before, model = build(cfg)[0], build(cfg)[0]
     if not pretrained:  # otherwise only the adapter has learnt
         torch.manual_seed(0)

@@ -16,7 +16,7 @@ from proprio_mllm.model.word_tokens import add_word_tokens, known_words, tokens_
 from proprio_mllm.model.wording import name_words
 from proprio_mllm.training.base import DenseObjective, JointObjective, grounding_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, base_model_config, seeded
-from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Demos, Views
+from proprio_mllm.training.sources import BODY_RELATIVE, GROUNDING, Clips, Views
 from proprio_mllm.training.stages.inputs import episodes_in_words, lessons_of, turns_of
 from proprio_mllm.training.text import adopt, corpus, order_places, start_from_words, whole_words
 from proprio_mllm.training.turns import turn_accuracy
@@ -41,40 +41,44 @@ class BaseStage:
         """Trains and stores the base model, and measures it; nothing to do where pretrained weights are given."""
         if pipeline.needs_no(self.name):
             return {}
-        plain = dataclasses.replace(base_model_config(pipeline.cfg.model), sees=True)
+        cfg, plain = pipeline.cfg, dataclasses.replace(base_model_config(pipeline.cfg.model), sees=True)
         views, clips = Views(pipeline.paths.shards("views"), plain), Clips(pipeline.paths.shards("clips"))
+        given = pipeline.given(self.name)
+        model = _untrained(pipeline, plain, views, clips) if given is None else _released(pipeline, plain, given)
         demos = lessons_of(pipeline, plain)
-        if (given := pipeline.given(self.name)) is not None:
-            model = load_model(given)
-            unknown = set(pipeline.lessons.words()) - set(known_words(model.processor.tokenizer))
-            pipeline.fits(given, (model.cfg, f"without {sorted(unknown)[:3]}"), (plain, "without []"))
-        else:
-            model = _trained(pipeline, folder, key, plain, views, clips, demos)
+        turns = turns_of(pipeline, model, demos)
+        if given is None:
+            words = tokens_of(model.processor.tokenizer)
+            head = seeded(lambda: DenseHead([words.tokens(name_words(name)) for name in views.type_names]), cfg.seed)
+            dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
+            chosen = {id(p) for p in train_only(model, ("vision", "merger"))} | {id(p) for p in head.parameters()}
+            for parameter in dense.module.parameters():
+                parameter.requires_grad_(id(parameter) in chosen)
+            pipeline.loop(dense, cfg.base.dense, folder / "dense")
+            model.requires_grad_(True)
+            episodes = episodes_in_words(pipeline, model, f"{key}/words")
+            joint = JointObjective(model, head, views, turns, demos, clips, episodes, cfg.base, f"{key}/joint")
+            pipeline.loop(joint, cfg.base.joint, folder / "joint")
         pipeline.store("base", model)
         asked = grounding_accuracy(model, views, (*GROUNDING, *BODY_RELATIVE))
-        planned = turn_accuracy(model, turns_of(pipeline, model, demos))
-        return {**asked, **planned, **held_out_metrics(model, {"": pipeline.lessons.episode})}
+        return {**asked, **turn_accuracy(model, turns), **held_out_metrics(model, {"": pipeline.lessons.episode})}
 
 
-def _trained(
-    pipeline: Pipeline, folder: Path, key: str, plain: ModelConfig, views: Views, clips: Clips, demos: Demos
-) -> ProprioMLLM:
-    cfg, lessons = pipeline.cfg, pipeline.lessons
-    processor = build_processor(plain, corpus(plain, views, clips, cfg.seed), whole_words(views))
-    add_word_tokens(processor.tokenizer, lessons.words())
-    model = build_model(plain, processor, cfg.seed)
+def _untrained(pipeline: Pipeline, plain: ModelConfig, views: Views, clips: Clips) -> ProprioMLLM:
+    """The language model of `practice` with a vision tower that has learnt nothing."""
+    seed = pipeline.cfg.seed
+    processor = build_processor(plain, corpus(plain, views, clips, seed), whole_words(views))
+    add_word_tokens(processor.tokenizer, pipeline.lessons.words())
+    model = build_model(plain, processor, seed)
     adopt(model, load_model(pipeline.paths.model("practice")))
     start_from_words(model, views.type_names)
-    order_places(model, cfg.seed)
-    words = tokens_of(processor.tokenizer)
-    head = seeded(lambda: DenseHead([words.tokens(name_words(name)) for name in views.type_names]), cfg.seed)
-    dense = DenseObjective(model, head, views, cfg.base, f"{key}/dense")
-    chosen = {id(p) for p in train_only(model, ("vision", "merger"))} | {id(p) for p in head.parameters()}
-    for parameter in dense.module.parameters():
-        parameter.requires_grad_(id(parameter) in chosen)
-    pipeline.loop(dense, cfg.base.dense, folder / "dense")
-    model.requires_grad_(True)
-    turns, episodes = turns_of(pipeline, model, demos), episodes_in_words(pipeline, model, f"{key}/words")
-    joint = JointObjective(model, head, views, turns, demos, clips, episodes, cfg.base, f"{key}/joint")
-    pipeline.loop(joint, cfg.base.joint, folder / "joint")
+    order_places(model, seed)
+    return model
+
+
+def _released(pipeline: Pipeline, plain: ModelConfig, given: Path) -> ProprioMLLM:
+    """The released base model, if it is one of this configuration and knows the words of the lessons."""
+    model = load_model(given)
+    unknown = set(pipeline.lessons.words()) - set(known_words(model.processor.tokenizer))
+    pipeline.fits(given, (model.cfg, f"without {sorted(unknown)[:3]}"), (plain, "without []"))
     return model
