@@ -13,8 +13,8 @@ import torch
 
 from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.batch import Collator, Example
-from proprio_mllm.model.building import build_model, build_processor, load_model, save_model
-from proprio_mllm.model.groups import train_only
+from proprio_mllm.model.building import build_model, build_processor, load_model, merge_adapter, save_model
+from proprio_mllm.model.groups import group_of, train_only
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.word_tokens import WordTokens
 from proprio_mllm.model.wording import WordEpisode, WordTurn
@@ -116,6 +116,23 @@ def test_episodes_in_words_are_learnt_through_the_adapter(trained: Pipeline) -> 
     moved = [float(p.grad.abs().sum()) for p in model.parameters() if p.grad is not None]
     assert moved
     assert max(moved) > 0.0
+
+
+def test_alignment_that_goes_all_the_way_back_has_the_layers_of_words(
+    trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(trained.paths.root, tmp_path / "tiny")
+    alignment = dataclasses.replace(trained.cfg.alignment, go_back=1.0)
+    cfg = dataclasses.replace(trained.cfg, output=str(tmp_path), alignment=alignment)
+    pipeline = Pipeline(STAGES, cfg, collect, "", None, Lessons())
+    monkeypatch.setattr(pipeline, "loop", lambda *loop: None)
+    assert pipeline.run("alignment") is not None
+    model = load_model(pipeline.paths.model("alignment"))
+    merge_adapter(model)
+    before, base = (dict(load_model(trained.paths.model(name)).core.named_parameters()) for name in ("practice", "base"))
+    layers = {name: weights for name, weights in model.core.named_parameters() if group_of(name) == "lm"}
+    assert layers and all(torch.equal(weights, before[name]) for name, weights in layers.items())
+    assert any(not torch.equal(weights, base[name]) for name, weights in layers.items())
 
 
 def test_pretrained_weights_read_episodes_as_english(trained: Pipeline, tmp_path: Path) -> None:
