@@ -122,8 +122,8 @@ class PracticeConfig:
         own_share: share of what is learnt that is from those episodes.
         logged: share that is from the teacher's own episodes in the simulator; the rest is of the text world.
         workers: processes.
-        student: with pretrained weights, the stored model that acts (what alignment or selu made); the next alignment learns
-            from its episodes too. None leaves them out.
+        student: the stored model that acts in place of the words model (what alignment or selu made). With pretrained weights,
+            which have no words model, None leaves such episodes out.
     """
 
     loop: LoopConfig
@@ -304,10 +304,6 @@ class TrainConfig:
         )
         require(
             self.footprint is None or self.footprint > 0.0, f"footprint {self.footprint} must be positive: TFLOP/s of a GPU"
-        )
-        require(
-            self.practice.student is None or self.model.weights is not None,
-            f"practice.student {self.practice.student!r}: the model of stage words acts, unless model.weights are given",
         )
         require(
             self.model.weights is None or self.model.point_map.encoder != "named",

@@ -66,8 +66,9 @@ _LESSONS_FROM: Final = 700_000
 _PRACTICE_FROM: Final = 800_000
 _LESSON_STEPS: Final = 32
 MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
-#: Steps in a row that are foreseen before one is tried all the same, and heights in words.
-_MOST_FORESEEN: Final = 3
+#: Foreseen once between two tries: the next stance may be no better, and what has been refused can be read.
+_WALKS: Final = ("GoTo", "MoveAhead", "MoveBack", "MoveLeft", "MoveRight", "RotateLeft", "RotateRight")
+#: Heights in words.
 _HEIGHT_M: Final = 0.05
 #: How often a drawn family is of each category. Two things for two arms are learnt last.
 _CATEGORY_SHARES: Final = (0.2, 0.5, 0.3)
@@ -176,7 +177,7 @@ def run_lesson(
     robot, task, session, observation = _start(config, number, rng, sessions, family=family)
     session.step_limit = _LESSON_STEPS
     mistakes = float(rng.choice(MISTAKES))
-    episode, corrected = Episode(), 0
+    episode, walked = Episode(), False
     done = PlanStep((Action("Done"),))
     while not session.finished:
         answer = teacher(observation)
@@ -184,10 +185,10 @@ def run_lesson(
             break
         target, intent = answer
         taught = target.to_text()
-        look_ahead = config.foreseen and corrected < _MOST_FORESEEN
-        better = foreseen(session, observation, target, teacher) if look_ahead else None
-        corrected = 0 if better is None else corrected + 1
-        target = better or target
+        if config.foreseen and (better := foreseen(session, observation, target, teacher)) is not None:
+            walks = better.actions[0].name in _WALKS
+            target = target if walks and walked else better
+            walked |= walks
         step, origin = target, "teacher"
         if student is None and rng.random() < mistakes:
             step, origin = perturbed(target, observation, rng, intent)
@@ -198,6 +199,7 @@ def run_lesson(
                 step, origin = proposed, "student"
         executed = {"executed": step.to_text(), "origin": origin, "taught": taught}
         episode.rows.append(_row(observation, task, robot, number, target, executed))
+        walked &= not any(action.spec.arms for action in step.actions)
         observation, _ = session.step(step)
     episode.success, episode.steps = session.succeeded, len(episode.rows)
     if episode.success:

@@ -25,7 +25,7 @@ from proprio_mllm.model.tensors import read_tensors
 from proprio_mllm.training import release
 from proprio_mllm.training.alignment import PHASES, AlignmentObjective
 from proprio_mllm.training.pipeline import Pipeline, StageError, variant_model
-from proprio_mllm.training.rollouts import RolloutRequest, read_rollouts, rollout_row
+from proprio_mllm.training.rollouts import DaggerRequest, RolloutRequest, read_rollouts, rollout_row
 from proprio_mllm.training.sources import Demos, shard_hash
 from proprio_mllm.training.stages import STAGES, selu
 from proprio_mllm.training.stages.alignment import start
@@ -357,6 +357,24 @@ def test_released_parts_are_taken_and_not_trained(trained: Pipeline, tmp_path: P
     shutil.rmtree(tmp_path / "weights" / "tiny" / "pointmap")
     with pytest.raises(KeyboardInterrupt):
         pipeline.run("pointmap")  # is not there
+
+
+def test_another_model_may_act_in_practice_and_the_words_model_is_what_is_left(trained: Pipeline, tmp_path: Path) -> None:
+    release.export(trained, tmp_path / "weights")
+    shutil.copytree(trained.paths.root / "data", tmp_path / "run" / "tiny" / "data")
+    actors, sees = list[Path](), tmp_path / "weights" / "tiny" / "full"
+    practice = dataclasses.replace(trained.cfg.practice, student=str(sees))
+    cfg = dataclasses.replace(trained.cfg, output=str(tmp_path / "run"), given=str(tmp_path / "weights"), practice=practice)
+
+    def correct_for(request: DaggerRequest, workers: int) -> None:
+        actors.append(request.model)
+        correct(request, workers)
+
+    pipeline = Pipeline(STAGES, cfg, collect, "", correct_for, Lessons())
+    for stage in ("words", "practice"):
+        pipeline.run(stage)
+    assert actors == [sees]
+    assert not load_model(pipeline.paths.model("practice")).cfg.sees
 
 
 def test_rollouts_refuse_the_benchmark(tmp_path: Path) -> None:

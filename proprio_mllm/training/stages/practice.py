@@ -1,7 +1,6 @@
 """Stage `practice`: DAgger in the simulator. The words model acts, its teacher answers, and it learns from both worlds.
 
-With pretrained weights a model that has been aligned may act (`practice.student`): it leaves episodes that the next alignment
-learns from.
+A model that has been aligned may act in its place (`practice.student`): the next alignment learns from its episodes.
 """
 
 from __future__ import annotations
@@ -50,16 +49,16 @@ class PracticeStage:
         if given and cfg.student is None:
             pipeline.needs_no(self.name)
             return {}
-        student = pipeline.paths.model("words") if cfg.student is None else Path(cfg.student)
-        _collect(pipeline, student, shards)
+        words = pipeline.paths.model("words")
+        _collect(pipeline, words if cfg.student is None else Path(cfg.student), shards)
         metrics = _as_teacher(shards)
         if given:
             return metrics
         lessons = pipeline.lessons
         taught, own = lessons.logged(pipeline.paths.shards("lessons")), lessons.logged(shards)
         episode = mixed(lessons.episode, (cfg.own_share, own), (cfg.logged, taught))
-        model = load_model(student)
-        if pipeline.given(self.name) is None:  # else the student has been through it
+        model = load_model(words)
+        if pipeline.given(self.name) is None:  # else it has been through it
             model.requires_grad_(False)
             model.core.model.language_model.requires_grad_(True)
             pipeline.loop(WordsObjective(model, episode, key, pipeline.cfg.words.reading), cfg.loop, folder / "loop")

@@ -170,6 +170,17 @@ def test_what_an_arm_cannot_reach_is_foreseen(robot: str) -> None:
     assert foreseen(session, observation, PlanStep((Action("RotateLeft", amount=10.0),)), teacher) is None
 
 
+def test_another_stance_is_foreseen_once_between_two_tries(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, medium_share=0.0, foreseen=True)
+    teacher = _Turning("Open(left, Microwave_9)")
+    walk, crouch = PlanStep((Action("MoveAhead", amount=0.1),)), PlanStep((Action("MoveDown", amount=0.05),))
+    answers = iter([walk, walk, walk, crouch, crouch, None, *[walk] * 40])
+    monkeypatch.setattr("sim.collection.demonstrations.foreseen", lambda *_: next(answers))
+    monkeypatch.setattr("sim.collection.demonstrations.MISTAKES", (0.0,))
+    targets = [row["target"].partition("(")[0] for row in run_lesson(config, 3, None, teacher).rows]
+    assert targets[:8] == ["MoveAhead", "Open", "MoveAhead", "MoveDown", "MoveDown", "Open", "MoveAhead", "Open"]
+
+
 class _Seen:
     known_objects = ("Mug_1", "SideTable_1")
 
