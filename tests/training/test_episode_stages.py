@@ -146,7 +146,7 @@ def test_pretrained_weights_read_episodes_as_english(trained: Pipeline, tmp_path
     model = dataclasses.replace(trained.cfg.model, weights=str(weights))
     with pytest.raises(ValueError, match=r"point_map\.encoder 'named'"):
         dataclasses.replace(trained.cfg, model=model)
-    model = dataclasses.replace(model, point_map=dataclasses.replace(model.point_map, encoder="sim"))
+    model = dataclasses.replace(model, places=False, point_map=dataclasses.replace(model.point_map, encoder="sim"))
     given = dataclasses.replace(trained.cfg, output=str(tmp_path), model=model)
     pipeline = Pipeline(STAGES, given, collect, "", None, Lessons())
     done = {stage: pipeline.run(stage) for stage in pipeline.stages}

@@ -82,6 +82,6 @@ def test_the_command(tmp_path: Path) -> None:
     words = [sys.executable, "train.py", "footprint=400", "model=qwen2_5_vl_7b", "budget=gpu", f"output={tmp_path / 'none'}"]
     done = subprocess.run(words, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True)
     assert "6,525,618,176" in done.stdout and "steps/h" in done.stdout and not (tmp_path / "none").exists()
-    words[3:4] = ["model.weights=nobody/nothing", "model.point_map.encoder=sim"]
+    words[3:4] = ["model.weights=nobody/nothing", "model.point_map.encoder=sim", "model.places=false"]
     done = subprocess.run(words, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
     assert done.returncode == 1 and "names whose shape is known: Qwen/Qwen2.5-VL-3B-Instruct" in done.stderr
