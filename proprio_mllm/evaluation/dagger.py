@@ -36,6 +36,8 @@ from sim.scene.compiler import PHYSICS
 
 #: Episodes of a part.
 _PER_PART: Final = 10
+#: Raised when the same request gives other rows, so that older ones are not taken for it.
+_VERSION: Final = 2
 
 
 def collect_dagger(request: DaggerRequest, robots: Sequence[str] = PAPER_ROBOTS, workers: int = 2) -> None:
@@ -59,7 +61,8 @@ def collect_dagger(request: DaggerRequest, robots: Sequence[str] = PAPER_ROBOTS,
             bar.refresh()
 
         about = {"student": model, "teacher_share": request.teacher_share}
-        _write(config, request.config_hash, job, about, report, overwrite=True)
+        key = config_hash({"request": request.config_hash, "version": _VERSION})
+        _write(config, key, job, about, report, overwrite=True)
 
 
 def collect_lessons(
@@ -73,7 +76,7 @@ def collect_lessons(
         overwrite: start over when the folder holds something else.
     """
     keyed = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "workers")}
-    keyed["version"] = 1
+    keyed["version"] = _VERSION
     report = progress or (lambda done, parts: None)
     return _write(config, config_hash(keyed), functools.partial(_lessons, config), {"config": keyed}, report, overwrite)
 
