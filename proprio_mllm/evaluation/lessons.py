@@ -1,12 +1,12 @@
 """Lessons: whole episodes in words with a teacher's answer at every step, right or wrong steps taken.
 
 The teacher is the scripted planner: what it answers is a function of what it is shown, in the text world as in the simulator,
-so a model that sees the same can learn it. Part of the steps that are taken are mistakes; the teacher's answer to what follows
-from them is what is learnt. Episodes are made in the text world, or read from logs of the simulator, which are told in the same
-words. In half of the episodes some object types bear made-up names, in the instruction and in their ids,
-so that things are named by reading and not by heart. Half of the episodes reflect on every failure, the others on none. In
-some the log tells failures as one bit, to teacher and learner alike. A teacher that foresees reach walks past every stance from
-which an arm cannot reach; who cannot would learn to walk to and fro, so the fourth walk to what no arm has tried is not learnt.
+so a model that sees the same can learn it. Part of the steps that are taken are mistakes; the teacher's answer to what
+follows from them is what is learnt. Episodes are made in the text world, or read from logs of the simulator, which are told
+in the same words. In half of the episodes some object types bear made-up names, in the instruction and in their ids, so that
+things are named by reading and not by heart. Half of the episodes reflect on every failure, the others on none. In some the
+log tells failures as one bit, to teacher and learner alike. A fourth walk to what no arm has tried is not learnt, since
+planners do not say it (`Belief.walked_enough`).
 
 This is the bridge that `train.py` wires: training asks for the episode of a seed and knows neither worlds nor planners.
 """

@@ -12,7 +12,7 @@ ends the episode, in a share of the steps, and after as many steps as the task a
 Lessons are episodes with another teacher, a function of what a planner reads, at the controls: right steps, mistakes and a
 student's steps, each kept with the teacher's answer whether the goals are met in the end or not. What that teacher cannot read
 before its first try, how high, how far and which arm, the simulator's reach test can foresee (`foreseen`): such an answer is
-one for planners that see and feel.
+one for planners that see and feel. Another stance is foreseen once between two tries of an arm.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ import numpy as np
 from configs.schema.collect import CollectConfig
 from data.shards import encode_png
 from interface.actions import ActionKind
+from interface.effects import Rise
 from interface.failures import FailureCode
 from interface.observation import HistoryItem, Observation
 from interface.steps import Action, PlanStep
@@ -66,8 +67,6 @@ _LESSONS_FROM: Final = 700_000
 _PRACTICE_FROM: Final = 800_000
 _LESSON_STEPS: Final = 32
 MISTAKES: Final = (0.0, 0.0, 0.1, 0.3)
-#: Foreseen once between two tries: the next stance may be no better, and what has been refused can be read.
-_WALKS: Final = ("GoTo", "MoveAhead", "MoveBack", "MoveLeft", "MoveRight", "RotateLeft", "RotateRight")
 #: Heights in words.
 _HEIGHT_M: Final = 0.05
 #: How often a drawn family is of each category. Two things for two arms are learnt last.
@@ -186,8 +185,9 @@ def run_lesson(
         target, intent = answer
         taught = target.to_text()
         if config.foreseen and (better := foreseen(session, observation, target, teacher)) is not None:
-            walks = better.actions[0].name in _WALKS
-            target = target if walks and walked else better
+            moves = better.actions[0].spec
+            walks = moves.kind is ActionKind.BODY and not moves.has_effect(Rise)
+            target = target if walks and walked else better  # the next stance may be no better; what is refused can be read
             walked |= walks
         step, origin = target, "teacher"
         if student is None and rng.random() < mistakes:
