@@ -43,10 +43,10 @@ class Placing:
 
     @torch.no_grad()
     def __call__(self, views: Sequence[View], things: Sequence[Words]) -> list[Words]:
-        """The place of one thing in each picture, in words; none where it is not found.
+        """The place of one thing in each picture, in words; none where it is not found, or the body is hidden.
 
         Args:
-            views: pictures with camera and key bodies.
+            views: pictures with camera and key bodies; a hidden body's are zeros, from which nothing can be placed.
             things: the words of an id each.
         """
         images = self._collator.images(views).to(self._table.device)
@@ -59,7 +59,8 @@ class Placing:
         found: list[Words] = []
         for view, centre, known in zip(views, centres.cpu().numpy(), sure.tolist(), strict=True):
             assert view.camera is not None and view.key_bodies is not None
-            found.append(place_words(to_pelvis(view.camera, centre), view.key_bodies) if known else ())
+            told = known and view.key_bodies.any()
+            found.append(place_words(to_pelvis(view.camera, centre), view.key_bodies) if told else ())
         return found
 
 

@@ -85,6 +85,8 @@ def test_only_what_is_seen_alone_has_a_place(trained: Pipeline) -> None:
         "do",
         "Done",
     )
+    numb = dataclasses.replace(view, key_bodies=np.zeros_like(view.key_bodies))
+    assert Placing(model, finder)([view, numb], [thing, thing]) == [place, ()], "from a hidden body nothing can be placed"
     other = answers((*thing[:-1], "_16"))
     assert placed(other, demos, Placing(model, finder)) == other
     torch.nn.init.constant_(finder.scale, -9.0)  # nothing looks like anything
