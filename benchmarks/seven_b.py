@@ -108,7 +108,13 @@ def random_weights(model: ModelConfig, folder: Path) -> Path:
 
 def settings(options: Options, folder: Path) -> list[str]:
     """Overrides of `train.py`."""
-    common = ["budget=debug", f"model={options.model}", "model.point_map.encoder=sim", "logger.wandb=disabled"]
+    common = [
+        "budget=debug",
+        f"model={options.model}",
+        "model.point_map.encoder=sim",
+        "model.places=false",
+        "logger.wandb=disabled",
+    ]
     words = [*common, f"output={folder}", *options.train]
     model = build(TrainConfig, compose("train", words)).model
     weights = random_weights(model, folder / "weights") if options.weights is None else Path(options.weights)
