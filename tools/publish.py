@@ -1,8 +1,8 @@
-"""Keeps what docs/benchmark.md says of runs, as files beside it: `python -m tools.publish RUN [RUN …]`.
+"""Keeps what docs/benchmark.md says of runs, as files beside it: `python -m tools.publish RUN [RUN …] [below=FOLDER]`.
 
 `docs/results/NAME.json` holds a run's command, physics, weights and rows, and task by task whether it was solved and in time; a
-folder below it, those of an older physics. Tests hold the figures of README.md and docs/benchmark.md against
-these files, and `make reproduce` holds a rerun against them.
+folder below it, those of an older physics (`physics_2`) or of another training (`seed_1`). Tests hold the figures of README.md
+and docs/benchmark.md against these files, and `make reproduce` holds a rerun against them.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from configs.arguments import NoOptions, command, read_named
+from configs.arguments import command, read_named
 from data.files import read_json, write_text
 from interface.episode import Outcome
 from proprio_mllm.report.references import references_of
@@ -51,12 +52,24 @@ def results(folder: str = ".") -> dict[str, dict[str, Any]]:
     return {path.stem: read_json(path) for path in sorted((FOLDER / folder).glob("*.json"))}
 
 
+@dataclass(frozen=True)
+class Options:
+    """Command line.
+
+    Attributes:
+        below: folder below `docs/results`.
+    """
+
+    below: str = "."
+
+
 @command(ValueError, OSError)
 def main(arguments: Sequence[str]) -> int:
     """Publishes runs under their folders' names without the hash."""
-    folders, _ = read_named(NoOptions, arguments, ("RUN",), more=True)
+    folders, options = read_named(Options, arguments, ("RUN",), more=True)
     for folder in map(Path, folders):
-        target = FOLDER / f"{folder.resolve().name.rpartition('-')[0]}.json"
+        target = FOLDER / options.below / f"{folder.resolve().name.rpartition('-')[0]}.json"
+        target.parent.mkdir(exist_ok=True)
         write_text(target, json.dumps(published(load_run(folder)), indent=1) + "\n")
         sys.stdout.write(f"{target}\n")
     return 0

@@ -193,14 +193,15 @@ class Pipeline:
         Raises:
             StageError: when there are no released weights of this model.
         """
-        if self.cfg.given is None or stage not in _GIVEN:
+        names = _GIVEN | ({"alignment": self.paths.variant} if self.cfg.given_alignment else {})
+        if self.cfg.given is None or stage not in names:
             return None
         released = Path(self.cfg.given) / self.cfg.model.name
         if not released.is_dir():
             raise StageError(
                 f"given={self.cfg.given}: no folder {released}; it is where released weights are, such as `weights`"
             )
-        folder = released / _GIVEN[stage]
+        folder = released / names[stage]
         return folder if folder.is_dir() else None
 
     def fits(self, given: Path, has: object, wanted: object) -> None:

@@ -26,6 +26,8 @@ def test_a_run_is_kept_task_by_task_without_its_machine(tmp_path: Path, monkeypa
     assert kept["command"] == "python eval.py planner=random robot=h1"
     assert (kept["solved"], kept["in_time"]) == ("1101", "1000")
     assert kept["rows"]["all"]["successes"] == 3 and kept["rows"]["single"]["in_time"] == 1
+    assert publish.main([str(folder), "below=seed_1"]) == 0
+    assert publish.results("seed_1") == publish.results()
 
 
 def test_a_run_under_way_is_not_published(tmp_path: Path) -> None:

@@ -332,7 +332,14 @@ def test_released_parts_are_taken_and_not_trained(trained: Pipeline, tmp_path: P
             torch.testing.assert_close(ours[name], tensor, atol=1e-3, rtol=1e-3)
     with pytest.raises(KeyboardInterrupt):
         pipeline.run("alignment")  # is trained
-    assert release.export(pipeline, tmp_path / "weights") == [], "what was taken from there keeps its provenance"
+    aligned = Pipeline(STAGES, dataclasses.replace(cfg, given_alignment=True), collect, "", correct, Lessons())
+    assert aligned.run("alignment") is not None and aligned.is_current("alignment")
+    taken, theirs = load_model(aligned.paths.model("alignment")), load_model(trained.paths.model("selu")).state_dict()
+    assert all(torch.allclose(theirs[name], tensor, atol=1e-4, rtol=1e-3) for name, tensor in taken.state_dict().items())
+    for one in (pipeline, aligned):
+        assert release.export(one, tmp_path / "weights") == [], "what was taken from there keeps its provenance"
+    with pytest.raises(ValueError, match="given_alignment=true takes from `given`, which is not set"):
+        dataclasses.replace(trained.cfg, given_alignment=True)
 
     wider = dataclasses.replace(cfg.model, text=dataclasses.replace(cfg.model.text, hidden=128))
     longer = dataclasses.replace(cfg.model, motion=dataclasses.replace(cfg.model.motion, codes=64))

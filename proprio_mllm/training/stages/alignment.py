@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from configs.schema.model import ModelConfig
 from proprio_mllm.model.building import (
     add_adapter,
     build_model,
@@ -41,7 +42,15 @@ class AlignmentStage:
         return {"alignment": dataclasses.asdict(cfg.alignment), "model": model}
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
-        """Trains and stores the variant's model, and measures grounding, body state and planning."""
+        """Trains and stores the variant's model, and measures grounding, body state and planning.
+
+        A released one is stored as it is, and not measured again.
+        """
+        if (given := pipeline.given(self.name)) is not None:
+            model = load_model(given)
+            pipeline.fits(given, model.cfg, _config(pipeline))
+            pipeline.store("alignment", model, MotionTokenizer.load(given / "motion") if model.cfg.proprioception else None)
+            return {}
         model = start(pipeline)
         tokenizer = MotionTokenizer.load(pipeline.paths.model("tokenizer"))
         views, clips = Views(pipeline.paths.shards("views"), model.cfg), Clips(pipeline.paths.shards("clips"))
@@ -66,7 +75,7 @@ class AlignmentStage:
 
 def start(pipeline: Pipeline) -> ProprioMLLM:
     """The base model with this variant's MPE and CSE and the trained point map."""
-    cfg = dataclasses.replace(variant_model(pipeline.cfg.model, pipeline.cfg.variant), sees=True)
+    cfg = _config(pipeline)
     point_map = point_map_of(pipeline, cfg) if cfg.cse.enabled else None
     if cfg.weights is None:
         base = load_model(pipeline.paths.model("base"))
@@ -77,3 +86,8 @@ def start(pipeline: Pipeline) -> ProprioMLLM:
         model = build_model(cfg, build_processor(cfg), pipeline.cfg.seed, point_map)
     seeded(lambda: add_adapter(model), pipeline.cfg.seed)
     return model
+
+
+def _config(pipeline: Pipeline) -> ModelConfig:
+    """The variant's."""
+    return dataclasses.replace(variant_model(pipeline.cfg.model, pipeline.cfg.variant), sees=True)
