@@ -121,9 +121,9 @@ def newest(
 ) -> Run | None:
     """The run to show in a cell: of these settings, the one with most episodes of the category, then the newest.
 
-    Runs with another number of steps, over a part of the tasks (`limit`, `split`), from other start poses, with other rules of
-    contingencies, with a planner or a backend set otherwise than in its file (`as_published`), or with a script in place of a
-    model are left out.
+    Runs with another number of steps, with feedback of one bit, over a part of the tasks (`limit`, `split`), from other start
+    poses, with other rules of contingencies, with a planner or a backend set otherwise than in its file (`as_published`), or with
+    a script in place of a model are left out.
 
     Args:
         runs: the newest first.
@@ -134,12 +134,14 @@ def newest(
         reflection: `on` or `off`.
         model: name of the backend's model; None takes any.
     """
+    usual = defaults_of(EvalConfig)
     fitting = [
         run
         for run in runs
         if (run.metadata["planner"], run.metadata["robot"], run.metadata["difficulty"]) == (planner, robot, difficulty)
         and (run.metadata["tasks"], run.metadata["limit"], run.metadata["start"]) == ("benchmark", None, "fixed")
-        and run.metadata.get("steps") == defaults_of(EvalConfig)["steps"]
+        and run.metadata.get("steps") == usual["steps"]
+        and run.metadata["config"].get("feedback", usual["feedback"]) == usual["feedback"]
         and run.metadata["category"] in ("all", category)
         and (run.metadata.get("split", "all"), run.metadata.get("reflection", "on")) == ("all", reflection)
         and not run.machinery

@@ -180,6 +180,8 @@ def test_a_planner_with_other_options_fills_no_cell(tmp_path, run, changed: dict
     assert find_runs(tmp_path)[0].title in table.notes[-1]
     run(tmp_path / "other", "dag_plan", "h1", contingencies="unlucky")
     assert newest(find_runs(tmp_path / "other"), "dag_plan", "h1", "easy") is None
+    run(tmp_path / "bit", "dag_plan", "h1", config={"feedback": "bit"})
+    assert newest(find_runs(tmp_path / "bit"), "dag_plan", "h1", "easy") is None
     run(tmp_path / "plain", "dag_plan", "h1", config={"planner": {"horizon": 1}})
     assert newest(find_runs(tmp_path / "plain"), "dag_plan", "h1", "easy") is not None
 
