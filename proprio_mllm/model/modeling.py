@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -270,6 +271,7 @@ class ProprioMLLM(nn.Module):
         max_new_tokens: int = 48,
         temperature: float = 0.0,
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
+        allowed: Sequence[Sequence[Sequence[int]]] | None = None,
     ) -> list[list[int]]:
         """Continues each row of a left-padded batch.
 
@@ -278,6 +280,7 @@ class ProprioMLLM(nn.Module):
             max_new_tokens: longest reply.
             temperature: 0 takes the most likely token, otherwise tokens are drawn.
             generator: draws the tokens, on the CPU; one per row keeps a row's draws apart from the other rows'.
+            allowed: token ids of the replies that each row has to choose among; None leaves them free.
 
         Returns:
             The new token ids of each row, without the closing token.
@@ -297,6 +300,11 @@ class ProprioMLLM(nn.Module):
         for _ in range(max_new_tokens):
             logits = self.following(batch, cache)
             logits[:, self._never] = float("-inf")
+            if allowed is not None:
+                free, logits = logits, torch.full_like(logits, float("-inf"))
+                for row, (said, choices) in enumerate(zip(replies, allowed, strict=True)):
+                    may = [[*one, self._end][len(said)] for one in choices if list(one[: len(said)]) == said]
+                    logits[row, may] = free[row, may]
             token = self._choose(logits, temperature, generator)  # (B,)
             done |= token == self._end
             if bool(done.all()):
@@ -317,7 +325,11 @@ class ProprioMLLM(nn.Module):
             return torch.cat(rows).to(logits.device)
         return torch.multinomial(shares, 1, generator=generator)[:, 0].to(logits.device)
 
-    def reply(self, batch: Batch, max_new_tokens: int = 48, temperature: float = 0.0) -> list[str]:
-        """`generate`, decoded to text, motion tokens included."""
-        rows = self.generate(batch, max_new_tokens, temperature)
+    def reply(
+        self, batch: Batch, max_new_tokens: int = 48, temperature: float = 0.0, allowed: Sequence[Sequence[str]] | None = None
+    ) -> list[str]:
+        """`generate`, decoded to text, motion tokens included; `allowed` are texts."""
+        encode: Any = partial(self.processor.tokenizer.encode, add_special_tokens=False)
+        spelt = None if allowed is None else [list(map(encode, choices)) for choices in allowed]
+        rows = self.generate(batch, max_new_tokens, temperature, allowed=spelt)
         return self.processor.tokenizer.batch_decode(rows, skip_special_tokens=True)

@@ -8,7 +8,8 @@ thing, how far, how high, which arm reaches it better, which arms are long enoug
 pelvis. The answers are the simulator's own. Beside the share of right answers (with its Wilson interval) stand that of the
 commonest answer and, with `blind`, that of the same model with a grey picture and a body of zeros.
 
-A stored model reads motion tokens and answers its own short questions. A model behind a backend is asked in English, with the
+A stored model reads motion tokens, is asked its own short questions, and chooses token by token among the answers that there
+are: what it knows is measured, not whether it keeps to a form. A model behind a backend is asked in English, with the
 picture and, unless `body=false`, its body in words (`proprio_mllm.planners.chat.view.body_text`); blind it gets neither.
 
 Paper: none; it says that proprioception helps, this asks what the model knows of it.
@@ -59,7 +60,7 @@ from sim.scene.rooms import room_names
 _ABOUT_THINGS: Final = ("side", "distance", "height", "arm", "reach")
 _ABOUT_SELF: Final = ("hands", "pelvis")
 _KINDS: Final = (*_ABOUT_THINGS, *_ABOUT_SELF)
-#: What a model behind a backend may answer, and how it is asked for it.
+#: What may be answered; heights of the pelvis are metres.
 _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "side": ("left", "ahead", "right"),
     "distance": ("near", "middle", "far"),
@@ -67,6 +68,7 @@ _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "arm": ("left", "right", "either"),
     "reach": ("left", "right", "both", "none"),
     "hands": ("left right", "left", "right", "none"),
+    "pelvis": tuple(f"{0.05 * step:.2f}" for step in range(4, 26)),
 }
 _METRES: Final = "Answer with the metres alone, rounded to 0.05, such as 0.85."
 
@@ -210,7 +212,8 @@ def _stored(folder: str) -> tuple[ModelConfig, Answering]:
     def answer(asked: Sequence[Question], blind: bool) -> list[str]:
         size, said = 64, list[str]()
         for start in tqdm(range(0, len(asked), size), desc="blind" if blind else "seeing", unit="batch"):
-            said += replies(model, [example(one, blind) for one in asked[start : start + size]], 10)
+            part = asked[start : start + size]
+            said += replies(model, [example(one, blind) for one in part], 10, [_CHOICES[one.kind] for one in part])
         return said
 
     return model.cfg, answer

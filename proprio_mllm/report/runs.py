@@ -122,8 +122,8 @@ def newest(
     """The run to show in a cell: of these settings, the one with most episodes of the category, then the newest.
 
     Runs with another number of steps, with feedback of one bit, over a part of the tasks (`limit`, `split`), from other start
-    poses, with other rules of contingencies, with a planner or a backend set otherwise than in its file (`as_published`), or with
-    a script in place of a model are left out.
+    poses, with other rules of contingencies, with a planner or a backend set otherwise than in its file (`as_published`), or
+    with a script in place of a model are left out.
 
     Args:
         runs: the newest first.

@@ -19,19 +19,23 @@ _SHORT: Final = 10
 
 
 @torch.no_grad()
-def replies(model: ProprioMLLM, asked: Sequence[Example], longest: int) -> list[str]:
+def replies(
+    model: ProprioMLLM, asked: Sequence[Example], longest: int, allowed: Sequence[Sequence[str]] | None = None
+) -> list[str]:
     """Greedy replies to open conversations, stripped.
 
     Args:
         model: in evaluation mode.
         asked: conversations without an answer.
         longest: tokens of a reply.
+        allowed: the replies among which each has to choose; None leaves them free.
     """
     collator = Collator(model.processor, model.cfg)
     found: list[str] = []
     for start in range(0, len(asked), _BATCH):
-        batch = collator(asked[start : start + _BATCH], generation=True).to(model.device)
-        found += [reply.strip() for reply in model.reply(batch, longest)]
+        rows = slice(start, start + _BATCH)
+        batch = collator(asked[rows], generation=True).to(model.device)
+        found += [reply.strip() for reply in model.reply(batch, longest, allowed=allowed and allowed[rows])]
     return found
 
 

@@ -12,7 +12,8 @@ from configs.schema.collect import CollectConfig
 from configs.schema.model import ModelConfig
 from data.motion import PELVIS_HEIGHT
 from proprio_mllm.backends.protocol import ChatImage, ChatReply, ChatRequest
-from proprio_mllm.report.bodyqa import Question, _chatting, _read, main, questions_of, scores
+from proprio_mllm.report import bodyqa
+from proprio_mllm.report.bodyqa import _CHOICES, Answering, Question, Score, _chatting, _read, main, questions_of, scores
 from proprio_mllm.training.sources import Views
 from sim.collection.collect import collect
 
@@ -103,11 +104,21 @@ def test_replies_are_read(kind: str, text: str, read: str) -> None:
     assert _read(kind, text) == read
 
 
-def test_the_released_model_is_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_released_model_is_asked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[tuple[Question, str]] = []
+
+    def scored(asked: Sequence[Question], answer: Answering, blind: bool) -> list[Score]:
+        said.extend(zip(asked, answer(asked, True), strict=True))
+        return scores(asked, answer, blind)
+
+    monkeypatch.setattr(bodyqa, "scores", scored)
     assert main([f"weights={WEIGHTS}/full", "questions=60", f"out={tmp_path}", "workers=1"]) == 0
     record = json.loads((tmp_path / "full.json").read_text())["scores"]
     assert record["all"]["asked"] == 60 and record["all"]["right"] > record["all"]["blind"]
     assert "BodyQA: full, h1, x1" in capsys.readouterr().out
+    assert all(one.answer in _CHOICES[one.kind] and answer in _CHOICES[one.kind] for one, answer in said)
     assert "kitchen_3" in json.loads((tmp_path / "full.json").read_text())["rooms"]
 
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from proprio_mllm.report.statistics import compare
+from data.files import read_json
+from proprio_mllm.report.statistics import compare, wilson
 from sim.scene.compiler import PHYSICS
 from tools.publish import results
 
@@ -104,6 +105,16 @@ def test_the_table_of_replanning() -> None:
             row = OLDER[name if name in OLDER else "proprio-h1-easy"]["rows"]["essential"]
             low, high = 100 * row["low"], 100 * row["high"]
             assert cell.strip() == f"{row['successes']} = {100 * row['success_rate']:.1f} % [{low:.1f}, {high:.1f}]"
+
+
+def test_the_table_of_its_own_body() -> None:
+    scores = read_json(ROOT / "docs" / "results" / "bodyqa" / "full.json")["scores"]
+    assert len(scores) == 8
+    for kind, one in scores.items():
+        low, high = (100 * limit for limit in wilson(one["right"], one["asked"]))
+        right, commonest, blind = (100 * one[name] / one["asked"] for name in ("right", "commonest", "blind"))
+        row = f"| {kind} | {one['asked']} | {right:.1f} [{low:.1f}, {high:.1f}] | {commonest:.1f} | {blind:.1f} |"
+        assert row in BENCHMARK.splitlines()
 
 
 def test_files_name_no_machine() -> None:

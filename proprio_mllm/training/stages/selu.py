@@ -199,7 +199,8 @@ class _Selu:
             return read_json(folder / "done.json")["metrics"]
         before = self.start if number == 0 else self.folder / f"round_{number - 1}" / "model"
         seed = self.pipeline.cfg.seed * 1000 + number
-        hashed, cfg = config_hash({"key": key}), self.cfg
+        cfg, actor = self.cfg, key if number else self.pipeline.key("alignment")  # the first rollouts serve other critics too
+        hashed = config_hash({"actor": actor, "episodes": cfg.episodes, "seed": seed, "temperature": cfg.temperature})
         request = RolloutRequest(before, folder / "rollouts", cfg.episodes, seed, cfg.temperature, hashed, cfg.rollouts)
 
         def act() -> None:
