@@ -15,7 +15,7 @@ from tools.publish import results
 
 ROOT = Path(__file__).parents[2]
 RESULTS = results()
-OLDER = results("physics_2")
+OLDER, BIT = results("physics_2"), results("bit")
 #: Planners of the published table, by the name of their row.
 PLANNERS = {
     "random legal actions (physics 2)": "random",
@@ -98,13 +98,36 @@ def test_the_table_of_ablations(planner: str) -> None:
 
 
 def test_the_table_of_replanning() -> None:
-    for reflection, first in (("", "| with reflection |"), ("-no_reflection", "| without |")):
-        (line,) = (line for line in BENCHMARK.splitlines() if line.startswith(first))
-        for cell, difficulty in zip(line.split("|")[2:-1], ("easy", "medium", "hard"), strict=True):
+    for reflection, label in (("", "with reflection"), ("-no_reflection", "without")):
+        lines = [
+            next(one for one in BENCHMARK.splitlines() if one.startswith(f"| {label}{end} |")) for end in ("", ": in time")
+        ]
+        told = zip(*(line.split("|")[2:-1] for line in lines), ("easy", "medium", "hard"), strict=True)
+        for cell, in_time, difficulty in told:
             name = f"proprio-h1-{difficulty}-essential{reflection}"
-            row = OLDER[name if name in OLDER else "proprio-h1-easy"]["rows"]["essential"]
+            if cell.strip() == "not run":
+                assert name not in RESULTS
+                continue
+            row = RESULTS[name if name in RESULTS else "proprio-h1-easy"]["rows"]["essential"]
             low, high = 100 * row["low"], 100 * row["high"]
             assert cell.strip() == f"{row['successes']} = {100 * row['success_rate']:.1f} % [{low:.1f}, {high:.1f}]"
+            assert in_time.strip() == str(row["in_time"])
+
+
+@pytest.mark.parametrize("planner", ["proprio", "words", "scripted"])
+def test_the_table_of_one_bit(planner: str) -> None:
+    rows = [RESULTS[f"{planner}-h1-easy"]["rows"]["essential"], BIT[f"{planner}-h1-easy-essential-bit"]["rows"]["essential"]]
+    cells = [
+        cell
+        for row in rows
+        for cell in (
+            f"{row['successes']} = {percent(row['success_rate'])}",
+            str(row["in_time"]),
+            percent(row["first_try_rate"]),
+        )
+    ]
+    label = next(label for label, name in PLANNERS.items() if name == planner)
+    assert f"| {label} | {' | '.join(cells)} |" in BENCHMARK.splitlines()
 
 
 def test_the_table_of_its_own_body() -> None:
@@ -118,7 +141,7 @@ def test_the_table_of_its_own_body() -> None:
 
 
 def test_files_name_no_machine() -> None:
-    files = {**RESULTS, **{f"physics_2/{name}": result for name, result in OLDER.items()}}
+    files = {**RESULTS, **{f"physics_2/{name}": one for name, one in OLDER.items()}, **BIT}
     for name, result in files.items():
         assert re.fullmatch(r"python eval\.py( [\w.]+=[\w,.-]+)+", result["command"]), name
         assert len(result["solved"]) == len(result["in_time"]) == result["rows"]["all"]["episodes"]
