@@ -1,7 +1,7 @@
 """Keeps what docs/benchmark.md says of runs, as files beside it: `python -m tools.publish RUN [RUN …] [below=FOLDER]`.
 
 `docs/results/NAME.json` holds a run's command, physics, weights and rows, and task by task whether it was solved and in time; a
-folder below it, those of an older physics (`physics_2`) or of another training (`seed_1`). Tests hold the figures of README.md
+folder below it, those of an older physics, another feedback or another training. Tests hold the figures of README.md
 and docs/benchmark.md against these files, and `make reproduce` holds a rerun against them.
 """
 
