@@ -169,7 +169,7 @@ def test_the_model_answers_every_question_under_the_critics_adapter(monkeypatch:
         def to(self, device: str) -> Batch:
             return self
 
-    def reply(batch: Batch, tokens: int) -> list[str]:
+    def reply(batch: Batch, tokens: int, allowed: None) -> list[str]:
         sizes.append((len(batch), tokens))
         return [next(told) for _ in batch]
 
