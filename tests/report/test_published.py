@@ -149,6 +149,7 @@ def test_the_table_of_learning_from_itself(robot: str) -> None:
 
 def test_files_name_no_machine() -> None:
     files = {**RESULTS, **{f"physics_2/{name}": one for name, one in OLDER.items()}, **BIT}
+    files |= {f"selu_oracle/{name}": one for name, one in SELU.items()}
     for name, result in files.items():
         assert re.fullmatch(r"python eval\.py( [\w.]+=[\w,.-]+)+", result["command"]), name
         assert len(result["solved"]) == len(result["in_time"]) == result["rows"]["all"]["episodes"]

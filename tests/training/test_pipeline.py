@@ -262,6 +262,22 @@ def test_a_critic_that_is_often_wrong_teaches_the_actor_nothing(
     assert bool(moved) is counts
 
 
+def test_another_critic_is_taught_from_the_same_rollouts(trained: Pipeline, tmp_path: Path) -> None:
+    shutil.copytree(trained.cfg.output, tmp_path / "run")
+    first, longer = trained.cfg.selu, dataclasses.replace(trained.cfg.selu.critic, steps=9)
+    found: list[str] = []
+
+    def asked(request: RolloutRequest) -> None:
+        found.append(request.config_hash)
+        raise KeyboardInterrupt
+
+    for settings in (first, dataclasses.replace(first, critic=longer), dataclasses.replace(first, temperature=0.3)):
+        cfg = dataclasses.replace(trained.cfg, output=str(tmp_path / "run"), selu=settings, overwrite=True)
+        with pytest.raises(KeyboardInterrupt):
+            Pipeline(STAGES, cfg, asked, "", correct, Lessons()).run("selu")
+    assert found[0] == found[1] != found[2]
+
+
 def test_a_stage_that_is_stopped_is_not_finished(trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not even under the configuration that had finished: the folder holds something else by now."""
     shutil.copytree(trained.cfg.output, tmp_path / "run")
