@@ -126,6 +126,17 @@ def _open(examples):
     return [dataclasses.replace(example, messages=example.messages[:-1]) for example in examples]
 
 
+def test_a_row_chooses_among_its_allowed_replies(cfg, build, examples):
+    model, collate = build(cfg)
+    batch = collate(_open(examples), generation=True)
+    first, second = (model.processor.tokenizer.encode(text, add_special_tokens=False)[0] for text in ("a", "b"))
+    pairs = [[one, other] for one, other in ((first, second), (second, first))]
+    choices = [pairs if row % 2 else [[first], [first, second]] for row in range(len(batch.input_ids))]
+    for seed in range(8):
+        drawn = model.generate(batch, 6, 2.0, torch.Generator().manual_seed(seed), choices)
+        assert all(reply in among for reply, among in zip(drawn, choices, strict=True))
+
+
 def test_cached_generation_equals_full_recomputation_and_is_batch_invariant(cfg, build, examples):
     model, collate = build(cfg)
     questions = _open(examples)
