@@ -25,7 +25,8 @@ class CollectConfig:
         workers: processes; 1 stays in this one.
         views_per_world: views drawn from one arrangement of objects.
         noise: demos: probability that a perturbed step is executed in place of the expert's, whose choice is recorded.
-        medium_share: demos: share of episodes at medium difficulty, so that recoveries appear.
+        chance_share: demos: share of episodes in which skills fail by chance, one in three of them at `hard`, the others at
+            `medium`, so that recoveries appear.
         foreseen: lessons: whether the right step is the one that the reach test foresees (`sim.collection.demonstrations`).
     """
 
@@ -40,14 +41,14 @@ class CollectConfig:
     workers: int = 1
     views_per_world: int = 48
     noise: float = 0.2
-    medium_share: float = 0.15
+    chance_share: float = 0.3
     foreseen: bool = False
 
     def __post_init__(self) -> None:
         for name in ("count", "image_size", "part_size", "workers", "views_per_world"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("noise", "medium_share"):
+        for name in ("noise", "chance_share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be within [0, 1], got {getattr(self, name)}")
         if not self.robots or not self.rooms:

@@ -264,7 +264,8 @@ class TrainConfig:
         given: folder of released weights, such as `weights`: the language model of words and practice, the base model, the
             point map and the motion tokenizer are taken from there, where it has them, in place of being trained. None trains
             everything.
-        given_alignment: whether the variant's model is taken from there too, so that `stage=selu` goes on from a released one.
+        given_alignment: what alignment makes of the variant's model from there: it is `taken` as it is, so that `stage=selu`
+            goes on from a released one, or `continued` by phase `joint` alone. None trains it from `base`.
         resume: continue an interrupted stage from its checkpoint.
         data: where motions come from, and what is kept of them.
         collect: what the simulator writes before training.
@@ -295,7 +296,7 @@ class TrainConfig:
     overwrite: bool = False
     release: str | None = None
     given: str | None = None
-    given_alignment: bool = False
+    given_alignment: Literal["taken", "continued"] | None = None
     resume: bool = True
 
     def __post_init__(self) -> None:
@@ -317,5 +318,8 @@ class TrainConfig:
         )
         require(not self.shard or self.model.weights is not None, "shard=true shares a frozen backbone; set model.weights")
         require(not (self.shard and self.model.four_bit), "shard=true cannot share layers of 4 bits: leave out one of the two")
-        require(not self.given_alignment or self.given is not None, "given_alignment=true takes from `given`, which is not set")
+        require(
+            self.given_alignment is None or self.given is not None,
+            f"given_alignment={self.given_alignment} takes from `given`, which is not set",
+        )
         require(self.micro_batches >= 1, f"micro_batches {self.micro_batches} must be at least 1")

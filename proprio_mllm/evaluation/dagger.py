@@ -37,7 +37,7 @@ from sim.scene.compiler import PHYSICS
 #: Episodes of a part.
 _PER_PART: Final = 10
 #: Raised when the same request gives other rows, so that older ones are not taken for it.
-_VERSION: Final = 2
+_VERSION: Final = 3
 
 
 def collect_dagger(request: DaggerRequest, robots: Sequence[str] = PAPER_ROBOTS, workers: int = 2) -> None:

@@ -64,6 +64,8 @@ _RENAMED: Final = 0.5
 #: Share of episodes that reflect, and of those in which a log has `Failed` in place of every failure code.
 _REFLECTING: Final = 0.5
 _AS_BIT: Final = 0.1
+#: Share of episodes whose log lacks its first steps, as that of a long one does (`proprio_mllm.model.observing`).
+_LATE: Final = 0.1
 _MOST_RENAMED: Final = 5
 _SYLLABLES: Final = ("ba", "do", "fi", "gu", "ka", "lo", "mi", "nu", "pe", "ra", "so", "tu", "va", "wo", "xi", "zu")
 #: Numbers of instructions; counts of things.
@@ -155,7 +157,7 @@ class Lessons:
                 break
             record.look(shown, step, job.verb, job.target)
             episode.take(world.mistake(step) if rng.random() < mistakes else step)
-        return record.episode()
+        return _from_late(record.episode(), rng)
 
     def logged(self, folder: Path) -> Callable[[int], WordEpisode]:
         """Episodes of the simulator with the teacher's answers, each drawn with a seed; those of negative seeds are held out.
@@ -176,7 +178,7 @@ class Lessons:
             known = looks[-1].known_objects
             names = _new_names(known, set(known) - set(looks[0].known_objects), rng)
             reflects, bits = (bool(one) for one in rng.random(2) < (_REFLECTING, _AS_BIT))
-            return _of_log([_in_bits(one) for one in looks] if bits else looks, done, names, reflects)
+            return _from_late(_of_log([_in_bits(one) for one in looks] if bits else looks, done, names, reflects), rng)
 
         return episode
 
@@ -187,6 +189,13 @@ class Lessons:
             targets.setdefault(episode, []).append(PlanStep.parse(target))
         logs = enumerate(_logs(folder).items())
         return tuple(_of_log(looks, done, {}, number % 2 == 0, targets[name]) for number, (name, (looks, done)) in logs)
+
+
+def _from_late(episode: WordEpisode, rng: np.random.Generator) -> WordEpisode:
+    """Some episodes from a later step on, told as if it were the first; the others as they are."""
+    late, share = rng.random(2)
+    first = int(share * len(episode.turns)) if late < _LATE else 0
+    return replace(episode, turns=episode.turns[first:])
 
 
 def _in_bits(shown: Shown) -> Shown:

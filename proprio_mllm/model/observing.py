@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
+from typing import Final
 
 from configs.schema.model import ModelConfig
 from interface.observation import Observation
@@ -19,17 +21,24 @@ from proprio_mllm.model.vocabulary import motion_text
 from proprio_mllm.model.word_tokens import Tokens, opening
 from proprio_mllm.model.wording import log_words, prefix_words, state_words
 
+#: Longest log that is learnt from, words.
+LONGEST_LOG: Final = 320
+
 
 @dataclass(slots=True)
 class EpisodeLog:
     """An episode's log as tokens, observation by observation.
 
+    A log that would become longer than any that is learnt from loses its oldest steps, about half of it at once: what came of
+    them is in the state.
+
     Attributes:
         words: the episode's tokens.
         sightings: what has been seen, and what the log says.
         log: tokens of prefix and log.
-        told: how many steps are in the log.
+        told: how many steps were told.
         reflects: whether failures are reflected on.
+        sizes: tokens of the prefix and of each step that is in the log.
     """
 
     words: Tokens
@@ -37,16 +46,30 @@ class EpisodeLog:
     log: list[int] = field(default_factory=list)
     told: int = 0
     reflects: bool = False
+    sizes: list[int] = field(default_factory=list)
 
     def look(self, observation: Seen) -> list[int]:
         """Takes in an observation, at most one step after the last; the tokens of the state, which follow the log."""
         self.sightings.look(observation)
-        if not self.log:
-            self.log = self.words.tokens(prefix_words(observation))
-        else:
-            self.log += self.words.tokens(log_words(observation.history[self.told :], self.sightings.new))
+        steps = observation.history[self.told :]
+        more = self.words.tokens(log_words(steps, self.sightings.new) if self.log else prefix_words(observation))
+        self.log += more
+        self.sizes.append(len(more))
         self.told = len(observation.history)
+        longest = round(LONGEST_LOG * self.words.length)
+        if len(self.log) > longest:
+            self._forget(longest // 2)
         return self.words.tokens(state_words(self.sightings, self.reflects))
+
+    def _forget(self, kept: int) -> None:
+        """Drops the oldest steps, the newest apart, until so many tokens are left."""
+        prefix, *steps = self.sizes
+        dropped = next(
+            (number for number, size in enumerate(accumulate(steps, initial=0)) if len(self.log) - size <= kept), len(steps)
+        )
+        dropped = min(dropped, len(steps) - 1)
+        if dropped > 0:
+            del self.log[prefix : prefix + sum(steps[:dropped])], self.sizes[1 : 1 + dropped]
 
 
 def view_of(observation: Observation) -> View:

@@ -74,8 +74,11 @@ class WordsState(EpisodeLog):
 
     def look(self, observation: Seen) -> list[int]:
         """As the log does; counts what was refused."""
-        known = self.told
+        known, steps = self.told, len(self.sizes)
         now = EpisodeLog.look(self, observation)
+        if len(self.sizes) <= steps and self.cached > self.sizes[0]:  # the oldest were dropped
+            self.cached = self.sizes[0]
+            self.cache.crop(self.cached - self.cache.get_seq_length())
         if self.told > known:
             self._count(observation)
         return now

@@ -188,7 +188,7 @@ class Pipeline:
         return stage_key(dict(stage.settings(self)) | own, self.paths.seed(name), inputs)
 
     def given(self, stage: str) -> Path | None:
-        """The folder of released weights with what a stage would train (`TrainConfig.given`); None where it has to train.
+        """The folder of released weights with what a stage would train (`TrainConfig.given`); None where it starts afresh.
 
         Raises:
             StageError: when there are no released weights of this model.
@@ -212,7 +212,11 @@ class Pipeline:
         """
         if has != wanted:
             raise StageError(f"given={self.cfg.given}: {given} is of {has}, the configuration asks for {wanted}")
-        logger.info("taken from %s, not trained", given)
+        logger.info("taken from %s", given)
+
+    def continues(self, stage: str) -> bool:
+        """Whether a stage goes on from what is given, in place of taking it as it is."""
+        return stage == "alignment" and self.cfg.given_alignment == "continued" and self.given(stage) is not None
 
     def ancestors(self, name: str) -> tuple[str, ...]:
         """A stage and everything that went into its output, in the order in which they run."""

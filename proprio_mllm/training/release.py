@@ -65,7 +65,7 @@ def export(pipeline: Pipeline, folder: str | Path) -> list[Path]:
         source = paths.model(stage)
         if (
             not source.is_dir()
-            or pipeline.given(stage) is not None
+            or (pipeline.given(stage) is not None and not pipeline.continues(stage))
             or not all(map(pipeline.is_current, pipeline.ancestors(stage)))
             or (stage == "alignment" and pipeline.is_current("selu"))
         ):

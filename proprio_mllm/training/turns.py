@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from proprio_mllm.model.batch import Batch, Collator, Example
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.observing import pictured_turn
+from proprio_mllm.model.observing import LONGEST_LOG, pictured_turn
 from proprio_mllm.model.placing import finder_of
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.sources import Demos
-from proprio_mllm.training.words import LONGEST_LOG
 
 #: Decisions of an episode in a batch, and episodes that are computed together.
 TURNS: Final = 6

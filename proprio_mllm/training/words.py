@@ -20,6 +20,7 @@ from torch.nn import functional
 from proprio_mllm.model.batch import IGNORE, Movable
 from proprio_mllm.model.branches import Branches, read_branches
 from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.observing import LONGEST_LOG
 from proprio_mllm.model.word_tokens import Tokens, first_word, tokens_of
 from proprio_mllm.model.wording import WordEpisode
 from proprio_mllm.training.loop import Objective, Parts
@@ -30,10 +31,8 @@ Source = Callable[[int], WordEpisode]
 _TURNS: Final = 6
 _ROWS: Final = 8
 #: Lengths of logs and of branches, words. Few lengths: kernels are prepared anew for every shape. What is longer is left out.
-_LOGS: Final = (128, 320)
+_LOGS: Final = (128, LONGEST_LOG)
 _BRANCHES: Final = (48, 96)
-#: Longest log, words.
-LONGEST_LOG: Final = _LOGS[-1]
 
 
 @dataclass(frozen=True, slots=True)

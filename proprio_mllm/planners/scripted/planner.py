@@ -147,7 +147,8 @@ class ScriptedPlanner:
         return [want for want in wants if want not in broken]
 
     def _given_up(self, job: Job, belief: Belief) -> bool:
-        return (job.verb, job.target or "") in belief.never or len(belief.failures(job.verb, job.target)) >= _PATIENCE
+        failed = [event for event in belief.failures(job.verb, job.target) if event.code not in _BY_CHANCE]
+        return (job.verb, job.target or "") in belief.never or len(failed) >= _PATIENCE
 
     # ---- the body
 
@@ -179,8 +180,8 @@ class ScriptedPlanner:
             return self._walk(job, belief, failed=bool(failed))
         if last.code in _HEIGHT:
             return self._height(job, belief, up=last.code == FailureCode.BODY_TOO_LOW)
-        if last.code in _BY_CHANCE and len(failed) % 3:
-            return None
+        if last.code in _BY_CHANCE:
+            return None  # nothing has to change
         if last.code in _KNOWLEDGE:
             return self._walk(job, belief, failed=False)
         if (

@@ -33,25 +33,29 @@ class AlignmentStage:
     name = "alignment"
     needs = ("base", "practice", "pointmap", "tokenizer")
     shards = ("lessons",)
-    recipe = 19
+    recipe = 20
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
-        """The phases and the variant's model."""
+        """The phases, the variant's model, and whether it goes on from a released one."""
         cfg = pipeline.cfg
         model = dataclasses.asdict(variant_model(cfg.model, cfg.variant))
-        return {"alignment": dataclasses.asdict(cfg.alignment), "model": model}
+        continued = {"continued": True} if pipeline.continues(self.name) else {}
+        return {"alignment": dataclasses.asdict(cfg.alignment), "model": model} | continued
 
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
         """Trains and stores the variant's model, and measures grounding, body state and planning.
 
-        A released one is stored as it is, and not measured again.
+        A released one is stored as it is and not measured again, or goes through the last phase once more.
         """
-        if (given := pipeline.given(self.name)) is not None:
-            model = load_model(given)
+        given, phases = pipeline.given(self.name), PHASES
+        if given is None:
+            model = start(pipeline)
+        else:
+            model, phases = load_model(given), {"joint": PHASES["joint"]}
             pipeline.fits(given, model.cfg, _config(pipeline))
-            pipeline.store("alignment", model, MotionTokenizer.load(given / "motion") if model.cfg.proprioception else None)
-            return {}
-        model = start(pipeline)
+            if not pipeline.continues(self.name):
+                pipeline.store("alignment", model, MotionTokenizer.load(given / "motion") if model.cfg.proprioception else None)
+                return {}
         tokenizer = MotionTokenizer.load(pipeline.paths.model("tokenizer"))
         views, clips = Views(pipeline.paths.shards("views"), model.cfg), Clips(pipeline.paths.shards("clips"))
         read = tokenizer if model.cfg.proprioception else None
@@ -59,11 +63,11 @@ class AlignmentStage:
         turns = turns_of(pipeline, model, demos, read)
         words = episodes_in_words(pipeline, model, f"{key}/words", turns)
         data = AlignmentData(model, tokenizer, clips, views, demos, turns, words, pipeline.cfg.alignment)
-        for phase, about in PHASES.items():
+        for phase, about in phases.items():
             train_only(model, about.groups)
             objective = AlignmentObjective(model, data, phase, pipeline.cfg.alignment, f"{key}/{phase}")
             pipeline.loop(objective, getattr(pipeline.cfg.alignment, phase), folder / phase)
-        if share := pipeline.cfg.alignment.go_back:
+        if given is None and (share := pipeline.cfg.alignment.go_back):
             before = load_model(pipeline.paths.model("practice")) if model.cfg.weights is None else None
             go_back(model, before, share)
         pipeline.store("alignment", model, read)

@@ -29,7 +29,7 @@ class PracticeStage:
     name = "practice"
     needs = ("words",)
     shards = ("lessons",)
-    recipe = 0
+    recipe = 1
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The loop, how much the model acts, and who acts where it is not the words model."""

@@ -20,7 +20,7 @@ class WordsStage:
     name = "words"
     needs = ()
     shards = ("lessons",)
-    recipe = 2
+    recipe = 3
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The loop and the plain backbone."""

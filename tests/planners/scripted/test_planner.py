@@ -123,6 +123,11 @@ def test_a_hopeless_action_is_given_up() -> None:
     assert answer("Pick up the mug.", lines, ["Mug_1"]) == "Done()"
 
 
+def test_what_fails_by_chance_is_tried_again_where_it_is() -> None:
+    lines = ["GoTo(Mug_1) ok", *["Pick(right, Mug_1) NothingHappened", "Pick(right, Mug_1) Slipped"] * 20]
+    assert answer("Pick up the mug.", lines, ["Mug_1"]) == "Pick(right, Mug_1)"
+
+
 def test_blocked_ways() -> None:
     lines = ["GoTo(Mug_1) BlockedPath"]
     assert answer("Pick up the mug.", lines, ["Mug_1"]).startswith("GoTo(Mug_1")

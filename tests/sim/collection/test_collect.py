@@ -94,7 +94,7 @@ def test_an_interrupted_run_is_continued(views, tmp_path):
 
 
 def test_an_episode_has_one_row_per_step_with_the_experts_choice():
-    config = CollectConfig("demos", "unused", 4, image_size=56, noise=0.5, medium_share=0.0, rooms=("kitchen_1",))
+    config = CollectConfig("demos", "unused", 4, image_size=56, noise=0.5, chance_share=0.0, rooms=("kitchen_1",))
     episode = run_episode(config, 1)
     again = run_episode(config, 1)
     assert [row["target"] for row in episode.rows] == [row["target"] for row in again.rows]
@@ -128,7 +128,7 @@ class _Silent(_Turning):
 
 
 def test_a_lesson_keeps_the_teachers_answer_to_every_step_and_ends_with_done():
-    config = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, medium_share=0.0)
+    config = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, chance_share=0.0)
     teacher = _Turning()
 
     def student(observation):
@@ -171,7 +171,7 @@ def test_what_an_arm_cannot_reach_is_foreseen(robot: str) -> None:
 
 
 def test_another_stance_is_foreseen_once_between_two_tries(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, medium_share=0.0, foreseen=True)
+    config = CollectConfig("demos", "unused", 20, image_size=56, noise=0.0, chance_share=0.0, foreseen=True)
     teacher = _Turning("Open(left, Microwave_9)")
     walk, crouch = PlanStep((Action("MoveAhead", amount=0.1),)), PlanStep((Action("MoveDown", amount=0.05),))
     answers = iter([walk, walk, walk, crouch, crouch, None, *[walk] * 40])

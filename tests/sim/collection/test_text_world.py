@@ -13,6 +13,7 @@ from interface.steps import Action, PlanStep
 from proprio_mllm.evaluation.lessons import WordsOnly
 from proprio_mllm.planners.scripted.planner import ScriptedPlanner
 from robots.spec import load_robot
+from sim.collection import text_world
 from sim.collection.text_facts import TextFacts
 from sim.collection.text_world import TextWorld
 from sim.tasks.drafts import Draft
@@ -71,6 +72,31 @@ def test_every_family_action_and_code_occurs(episodes: list[Played]) -> None:
         assert code == "ok" or code in Action.parse(text).spec.codes, text
     wanted = {"ok", "TooFar", "BodyTooHigh", "BodyTooLow", "HandEmpty", "HandOccupied", "AlreadyHeld", "AlreadyInState"}
     assert wanted | {"ObjectNotKnown", "BothHandsBusy", "GraspMissed"} <= {code for _, _, code in outcomes}
+
+
+def test_skills_fail_by_chance_as_the_simulators_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At `hard` a skill works one time in five, and what it does then is told by what it was to do, and with what."""
+    monkeypatch.setattr(text_world, "_DIFFICULTIES", {"hard": 1.0})
+    codes = dict.fromkeys(("ok", "NothingHappened", "Locked", "Slipped", "Broke", "Spilled"), 0)
+    for seed in range(150):
+        for item in play(seed).log:
+            for outcome in item.feedback.split("; "):
+                text, _, code = outcome.rpartition(" ")
+                if code in codes and Action.parse(text).name in ("Pick", "Place", "Open", "Lift", "PlaceBoth", "ToggleOn"):
+                    codes[code] += 1
+                    assert code != "Locked" or text.startswith("Open(")
+    assert min(codes.values()) > 0
+    assert 0.15 < codes["ok"] / sum(codes.values()) < 0.25
+
+
+def test_what_breaks_stays_broken() -> None:
+    scene = scene_of("kitchen_1")
+    facts = TextFacts(
+        Draft("pick", "kitchen_1", {"Mug_1": "CounterTop_1", "DishSponge_1": "CounterTop_1"}), scene, load_robot("h1")
+    )
+    for name in ("Mug_1", "DishSponge_1"):
+        facts.harm(name, breaks=True)
+    assert facts.object("Mug_1").broken and not facts.object("DishSponge_1").broken
 
 
 def test_food_cooks_in_a_pot_and_behind_a_door_that_is_shut() -> None:
