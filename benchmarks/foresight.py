@@ -1,6 +1,7 @@
 """What a thing's place tells, before a first try, of whether an arm would get there: the most that seeing could bring.
 
     python -m benchmarks.foresight lessons=150
+    python -m benchmarks.foresight lessons=0 tasks=2 robot=h1
 
 Lessons are played (`sim.collection.demonstrations`). Of every step of an arm at an object that the rules would take, the
 simulator's reach test says whether it would be in reach, too far, or refused because the body is too high or too low. What is
@@ -8,6 +9,9 @@ known is robot and verb, and the object's true centre in the pelvis heading fram
 with errors of some centimetres along each axis, as a point map makes them. The answer is the commonest among the nearest tries
 of other lessons with the same robot and verb; the share that is right is printed beside that of the commonest answer. Refusals
 for other reasons are left out.
+
+With `tasks`, the rules play tasks of the benchmark as they are, and once more with the reach test before every try: what a
+planner could gain that foresaw reach without an error.
 """
 
 from __future__ import annotations
@@ -29,9 +33,11 @@ from interface.failures import FailureCode
 from interface.observation import HistoryItem, Observation
 from interface.steps import Action, PlanStep
 from proprio_mllm.evaluation.dagger import Rules
-from sim.collection.demonstrations import run_lesson
+from proprio_mllm.evaluation.seeds import episode_seed
+from sim.collection.demonstrations import Foresight, run_lesson
 from sim.collection.view_sampling import center_in_pelvis
 from sim.session.session import Session
+from sim.tasks.task import CATEGORIES, STEP_LIMIT, Task, load_benchmark
 
 _REACH: Final = ("", FailureCode.TOO_FAR, FailureCode.BODY_TOO_HIGH, FailureCode.BODY_TOO_LOW)
 _NEAREST: Final = 9
@@ -43,12 +49,16 @@ class Options:
     """Command line.
 
     Attributes:
-        lessons: how many are played, of both robots in turn.
+        lessons: how many are played, of both robots in turn; 0 leaves out what places tell.
         seed: of the lessons.
+        tasks: every how manieth task of the benchmark is played; 0 plays none.
+        robot: who plays them.
     """
 
     lessons: int = 150
     seed: int = 21
+    tasks: int = 0
+    robot: str = "h1"
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,10 +137,44 @@ def right(tries: Sequence[Try], error_m: float | None, seed: int = 0) -> NDArray
     return found
 
 
+def played(tasks: Sequence[Task], robot: str, foresees: bool) -> list[tuple[bool, bool]]:
+    """Which tasks the rules solve within the paper's steps, and in time, with or without the reach test."""
+    session, results = Session(robot, "easy", 28), list[tuple[bool, bool]]()
+    for task in tqdm(tasks, desc="with the reach test" if foresees else "rules"):
+        observation = session.reset(task, episode_seed(0, task.id, robot, 0))
+        session.step_limit, rules = STEP_LIMIT, Rules()
+        foresight = Foresight(rules)
+        while not session.finished and (answer := rules(observation)) is not None:
+            step = foresight.better(session, observation, answer[0]) if foresees else answer[0]
+            observation, _ = session.step(step)
+            foresight.taken(step)
+        results.append((session.succeeded, session.succeeded and session.stats.charged <= task.time_limit))
+    return results
+
+
+def _print_bound(options: Options) -> None:
+    tasks = load_benchmark()[:: options.tasks]
+    sys.stdout.write(f"{options.robot}, {len(tasks)} tasks: solved, in time\n")
+    for foresees in (False, True):
+        results = np.array(played(tasks, options.robot, foresees))
+        by_category = [results[[task.category == name for task in tasks]].sum(axis=0) for name in CATEGORIES]
+        parts = ", ".join(f"{name} {solved} {timely}" for name, (solved, timely) in zip(CATEGORIES, by_category, strict=True))
+        solved, timely = results.sum(axis=0)
+        sys.stdout.write(f"{'with the reach test' if foresees else 'rules':20} {solved:4} {timely:4}  ({parts})\n")
+
+
 @command()
 def main(arguments: Sequence[str]) -> int:
-    """Prints the table."""
+    """Prints the tables."""
     options = read_arguments(Options, arguments)
+    if options.tasks:
+        _print_bound(options)
+    if options.lessons:
+        _print_places(options)
+    return 0
+
+
+def _print_places(options: Options) -> None:
     tries = tries_of(options)
     columns = {"words": right(tries, None), **{f"{100 * error:.0f} cm": right(tries, error) for error in _ERRORS_M}}
     verbs = Counter(one.kind[1] for one in tries)
@@ -140,7 +184,6 @@ def main(arguments: Sequence[str]) -> int:
         reached = np.mean([not one.code for one, chosen in zip(tries, these, strict=True) if chosen])
         shares = " ".join(f"{100 * float(values[these].mean()):7.1f}" for values in columns.values())
         sys.stdout.write(f"{verb:12} {int(these.sum()):6} {100 * reached:9.1f} {shares}\n")
-    return 0
 
 
 if __name__ == "__main__":

@@ -176,7 +176,7 @@ def run_lesson(
     robot, task, session, observation = _start(config, number, rng, sessions, family=family)
     session.step_limit = _LESSON_STEPS
     mistakes = float(rng.choice(MISTAKES))
-    episode, walked = Episode(), False
+    episode, foresight = Episode(), Foresight(teacher)
     done = PlanStep((Action("Done"),))
     while not session.finished:
         answer = teacher(observation)
@@ -184,11 +184,8 @@ def run_lesson(
             break
         target, intent = answer
         taught = target.to_text()
-        if config.foreseen and (better := foreseen(session, observation, target, teacher)) is not None:
-            moves = better.actions[0].spec
-            walks = moves.kind is ActionKind.BODY and not moves.has_effect(Rise)
-            target = target if walks and walked else better  # the next stance may be no better; what is refused can be read
-            walked |= walks
+        if config.foreseen:
+            target = foresight.better(session, observation, target)
         step, origin = target, "teacher"
         if student is None and rng.random() < mistakes:
             step, origin = perturbed(target, observation, rng, intent)
@@ -199,13 +196,42 @@ def run_lesson(
                 step, origin = proposed, "student"
         executed = {"executed": step.to_text(), "origin": origin, "taught": taught}
         episode.rows.append(_row(observation, task, robot, number, target, executed))
-        walked &= not any(action.spec.arms for action in step.actions)
+        foresight.taken(step)
         observation, _ = session.step(step)
     episode.success, episode.steps = session.succeeded, len(episode.rows)
     if episode.success:
         nothing = {"executed": done.to_text(), "origin": "teacher", "taught": done.to_text()}
         episode.rows.append(_row(observation, task, robot, number, done, nothing))
     return episode
+
+
+class Foresight:
+    """A teacher's steps, with the simulator's reach test before each that an arm cannot reach for.
+
+    Args:
+        teacher: tells where it would go if it were refused.
+    """
+
+    def __init__(self, teacher: Teacher) -> None:
+        self._teacher, self._walked = teacher, False
+
+    def better(self, session: Session, observation: Observation, step: PlanStep) -> PlanStep:
+        """What should be done in place of a step of the teacher; the step itself where it can be tried.
+
+        Another stance is foreseen once between two tries: the next may be no better, and what is refused can be read.
+        """
+        found = foreseen(session, observation, step, self._teacher)
+        if found is None:
+            return step
+        moves = found.actions[0].spec
+        walks = moves.kind is ActionKind.BODY and not moves.has_effect(Rise)
+        chosen = step if walks and self._walked else found
+        self._walked |= walks
+        return chosen
+
+    def taken(self, step: PlanStep) -> None:
+        """Takes notice of the step that was carried out."""
+        self._walked &= not any(action.spec.arms for action in step.actions)
 
 
 def foreseen(session: Session, observation: Observation, step: PlanStep, teacher: Teacher) -> PlanStep | None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.foresight import Options, Try, main, right, tries_of
+from sim.collection.demonstrations import Foresight
 
 
 def made(count: int, lessons: int = 20, decided: bool = True) -> list[Try]:
@@ -45,3 +46,20 @@ def test_lessons_are_played_and_their_tries_assessed(capsys: pytest.CaptureFixtu
     head, everything, *verbs = capsys.readouterr().out.splitlines()
     assert head.split() == ["tries", "in", "reach", "words", "0", "cm", "5", "cm", "10", "cm", "20", "cm"]
     assert int(everything.split()[1]) == len(tries) >= sum(int(line.split()[1]) for line in verbs) > 0
+
+
+def test_tasks_are_played_with_the_reach_test_and_without(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+    better = Foresight.better
+    monkeypatch.setattr(Foresight, "better", lambda *args: asked.append(True) or better(*args))
+    assert main(["lessons=0", "tasks=120"]) == 0
+    head, rules, foreseeing = capsys.readouterr().out.splitlines()
+    assert head == "h1, 3 tasks: solved, in time" and asked
+    assert (rules.startswith("rules "), foreseeing.startswith("with the reach test ")) == (True, True)
+    for line in (rules, foreseeing):
+        solved, timely = (int(word) for word in line.partition("(")[0].split()[-2:])
+        parts = [word.strip(",)") for word in line.partition("(")[2].split()]
+        assert (sum(map(int, parts[1::3])), sum(map(int, parts[2::3]))) == (solved, timely)
+        assert 0 <= timely <= solved <= 3
