@@ -58,11 +58,15 @@ class Memory:
         return self._meant[key]
 
     def _at_place(self, fitting: list[str], mention: Mention) -> list[str]:
-        """Of several things of a name those that came into view, or are in view, at the place where one is said to be."""
+        """Of several things of a name those that came into view, or are in view, at the place where one is said to be.
+
+        Before the robot was there, the only one that is known is taken for it while both it and the place are in view.
+        """
         assert mention.place is not None
         place = self.find(mention.place)
         if place is None or place not in self.belief.visited:
-            return fitting if place is None else []
+            alone = len(fitting) == 1 and type_of(fitting[0]) == mention.name and {fitting[0], place} <= set(self.seen.visible)
+            return fitting if place is None or alone else []
         found = [name for name in fitting if self.seen.found_at.get(name) == place]
         return found or [name for name in fitting if name in self.seen.visible]
 

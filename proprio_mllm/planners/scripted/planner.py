@@ -33,6 +33,7 @@ from proprio_mllm.planners.scripted.words import Mention
 #: Distances (m) and bearings (deg) of the stances that are tried in turn.
 _STANCES: Final[tuple[tuple[float | None, float | None], ...]] = (
     (None, None), (None, -20.0), (None, 20.0), (0.5, None), (0.4, None), (0.6, None), (0.5, -30.0), (0.5, 30.0),
+    (None, -40.0), (None, 40.0), (0.7, None), (0.5, -60.0), (0.5, 60.0), (0.7, -30.0), (0.7, 30.0),
 )  # fmt: skip
 #: Changes of pelvis height (m) that are tried in turn at one stance; a change back is half of that.
 _RISES_M: Final = (0.1, 0.15, 0.15)

@@ -268,6 +268,8 @@ def test_several_of_a_kind_are_told_apart_by_place() -> None:
     planner = ScriptedPlanner()
     planner.reset(TaskInfo("", "h1", 9), np.random.default_rng(0))
     pick = "Pick up the mug from the side table."
+    assert answer(pick, [], ["Mug_2"]) == answer(pick, [], ["Mug_1", "Mug_2", "SideTable_1"]) == "GoTo(SideTable_1)"
+    assert answer(pick, [], ["Mug_2", "SideTable_1"]) == "GoTo(Mug_2)"  # else one would see another there
     assert answer(pick, [], ["Mug_2"], planner) == "GoTo(SideTable_1)"
     assert answer(pick, ["GoTo(SideTable_1) ok"], ["Mug_2", "Mug_1"], planner) == "Pick(right, Mug_1)"
 
