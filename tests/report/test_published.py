@@ -9,13 +9,14 @@ from typing import Any
 import pytest
 
 from data.files import read_json
+from proprio_mllm.evaluation.run import weights_digest
 from proprio_mllm.report.statistics import compare, wilson
 from sim.scene.compiler import PHYSICS
 from tools.publish import results
 
 ROOT = Path(__file__).parents[2]
 RESULTS = results()
-OLDER, BIT, SELU = (results(name) for name in ("physics_2", "bit", "selu_oracle"))
+OLDER, BIT, SELU, FURTHER = (results(name) for name in ("physics_2", "bit", "selu_oracle", "continued"))
 #: Planners of the published table, by the name of their row.
 PLANNERS = {
     "random legal actions (physics 2)": "random",
@@ -147,9 +148,23 @@ def test_the_table_of_learning_from_itself(robot: str) -> None:
         assert f"| {label}, {robot.upper()} | {' | '.join(cells)} |" in LEARNT.splitlines()
 
 
+@pytest.mark.parametrize("robot", ["h1", "x1"])
+def test_the_table_of_training_further(robot: str) -> None:
+    name = f"proprio-{robot}-easy"
+    for label, run in (("released model", RESULTS[name]), ("trained further", FURTHER[name])):
+        row = run["rows"]["all"]
+        cells = (str(row["successes"]), str(row["in_time"]), percent(row["first_try_rate"]))
+        assert f"| {label}, {robot.upper()} | {' | '.join(cells)} |" in LEARNT.splitlines()
+    weights = {"full": RESULTS, "full-alignment": FURTHER}
+    for folder, runs in weights.items():
+        assert runs[name]["weights_digest"] == weights_digest(ROOT / "weights/tiny" / folder), "of the weights that are stored"
+
+
 def test_files_name_no_machine() -> None:
     files = {**RESULTS, **{f"physics_2/{name}": one for name, one in OLDER.items()}, **BIT}
-    files |= {f"selu_oracle/{name}": one for name, one in SELU.items()}
+    files |= {
+        f"{folder}/{name}": one for folder, some in (("selu", SELU), ("continued", FURTHER)) for name, one in some.items()
+    }
     for name, result in files.items():
         assert re.fullmatch(r"python eval\.py( [\w.]+=[\w,.-]+)+", result["command"]), name
         assert len(result["solved"]) == len(result["in_time"]) == result["rows"]["all"]["episodes"]
