@@ -36,6 +36,7 @@ WEIGHTS = Path(__file__).parents[2] / "weights" / "tiny"
 PARTS = {
     "base": ("mrope", False, False),
     "full": ("rope_sign", True, True),
+    "full-alignment": ("rope_sign", True, True),
 }
 EPISODES = ["words", "practice", "base", "pointmap", "tokenizer", "alignment"]
 
@@ -99,7 +100,7 @@ def test_it_says_where_it_comes_from(name: str) -> None:
     for stage in note["stages"].values():
         assert stage["command"].startswith("python train.py stage=")
         assert stage["metrics"]["seconds"] > 0
-    assert note["variant"] == ("full" if name == "base" else name)
+    assert note["variant"] == ("full" if name == "base" else name.removesuffix("-alignment"))
 
 
 @pytest.mark.parametrize("name", ["words", *PARTS])
@@ -107,7 +108,9 @@ def test_its_card_says_what_its_provenance_does(name: str) -> None:
     text = (WEIGHTS / name / "README.md").read_text()
     assert text == model_card(json.loads((WEIGHTS / name / "provenance.json").read_text()))
     _, front, body = text.split("---\n", 2)
-    assert yaml.safe_load(front)["license"] == "apache-2.0" and f"# Proprio-MLLM tiny, {name}" in body
+    assert (
+        yaml.safe_load(front)["license"] == "apache-2.0" and f"# Proprio-MLLM tiny, {name.removesuffix('-alignment')}\n" in body
+    )
     (command,) = (line.split("eval.py ")[1].split() for line in body.splitlines() if line.startswith("    python eval.py"))
     assert build(EvalConfig, compose("eval", command)).planner.kind == "mllm"
 
