@@ -51,7 +51,7 @@ class Options:
     Attributes:
         lessons: how many are played, of both robots in turn; 0 leaves out what places tell.
         seed: of the lessons.
-        tasks: every how manieth task of the benchmark is played; 0 plays none.
+        tasks: one in so many tasks of the benchmark is played; 0 plays none.
         robot: who plays them.
     """
 

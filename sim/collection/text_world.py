@@ -8,6 +8,7 @@ from a stance.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -21,7 +22,7 @@ from interface.steps import Action, PlanStep
 from robots.spec import RobotSpec
 from sim.collection.text_facts import TextFacts
 from sim.expert.jobs import Setting, plan_jobs
-from sim.session.contingency import Contingency, load_contingency
+from sim.session.contingency import CODES, Contingency, load_contingency, subject_of
 from sim.tasks.drafts import Draft, Scene
 
 _HEIGHT_STEP_M: Final = 0.05
@@ -29,15 +30,8 @@ _HEIGHT_STEP_M: Final = 0.05
 _STARTS_M: Final = (0.0, -0.05, -0.1, -0.2, -0.3)
 _LOWEST_M: Final = (-0.25, -0.35, -0.5)
 _HIGHEST_M: Final = 0.0
-#: Difficulties of episodes, with how many have each, and what a log says of an outcome that is no success.
+#: Difficulties of episodes, with the share that has each.
 _DIFFICULTIES: Final = {"easy": 0.5, "natural": 0.2, "medium": 0.2, "hard": 0.1}
-_OUTCOMES: Final = {
-    "nothing": FailureCode.NOTHING_HAPPENED,
-    "locked": FailureCode.LOCKED,
-    "slipped": FailureCode.SLIPPED,
-    "spilled": FailureCode.SPILLED,
-    "broken": FailureCode.BROKE,
-}
 #: How often physics says the same to an action that was right, every time from the same stance.
 _AWKWARD: Final = 0.08
 #: How often what one has walked to is still out of reach: arms that are solved apart from the waist do not lean. Some things
@@ -73,6 +67,8 @@ _MISHAPS: Final = (
 _FREE_ARMS: Final = (Arm.RIGHT, Arm.LEFT)
 _MOVES: Final = tuple(name for name, spec in ACTIONS.items() if spec.kind is ActionKind.BODY and not spec.takes_object)
 _LEGS: Final = ("MoveUp", "MoveDown")
+#: The rules of chance, read once: an episode takes less time than their file.
+_rules = functools.cache(load_contingency)
 
 
 def feedback_text(outcomes: Sequence[tuple[Action, str]]) -> str:
@@ -93,7 +89,7 @@ class TextWorld:
         self._draft, self._scene, self._rng, self._solver = draft, scene, rng, robot.solver
         self.facts = TextFacts(draft, scene, robot)
         difficulty = str(rng.choice(list(_DIFFICULTIES), p=list(_DIFFICULTIES.values())))
-        self._contingency = Contingency(load_contingency(), difficulty, 0)
+        self._contingency = Contingency(_rules(), difficulty, 0)
         self._height_m = float(rng.choice(_STARTS_M))
         self._lowest_m = float(rng.choice(_LOWEST_M))
         self._bands = {name: self._band() for name in scene.furniture}
@@ -219,21 +215,20 @@ class TextWorld:
         if codes and self._rng.random() < _AWKWARD:
             self._awkward[action] = codes[int(self._rng.integers(len(codes)))]
             return self._awkward[action]
-        return self._chance(action, target)
+        return self._chance(action)
 
-    def _chance(self, action: Action, target: str) -> str:
+    def _chance(self, action: Action) -> str:
         """What chance makes of an action that would work; empty when nothing."""
-        puts = action.spec.has_effect(PutDown)
-        subject = (self._held(action) if puts or action.spec.tool == "vessel" else None) or target
+        subject = subject_of(action, self._held(action))
         item = self.facts.object(subject)
         state = {"isFilledWithLiquid": item.fill > 0.0, "isToggled": item.on, "isDirty": item.dirty, "isBroken": item.broken}
         shares = self._contingency.distribution(action.name, subject.rpartition("_")[0], state)
         outcome = str(self._rng.choice(list(shares), p=list(shares.values())))
         if outcome in ("spilled", "broken"):
             self.facts.harm(subject, breaks=outcome == "broken")
-        if outcome == "broken" and puts:  # it lies where it was to stand
+        if outcome == "broken" and action.spec.has_effect(PutDown):  # it lies where it was to stand
             self._change(action)
-        return _OUTCOMES.get(outcome, "")
+        return CODES.get(outcome, "")
 
     def _held(self, action: Action) -> str | None:
         state = self.facts.state

@@ -23,9 +23,19 @@ import configs
 from configs.assets import asset_files
 from configs.validate import build
 from interface.actions import ACTIONS
+from interface.effects import PutDown
+from interface.failures import FailureCode
+from interface.steps import Action
 
-#: Outcomes that skills know how to act out.
-OUTCOMES: Final = ("success", "slipped", "spilled", "broken", "nothing", "locked")
+#: Outcomes that are no success and that skills know how to act out, with the code that the log then has.
+CODES: Final[Mapping[str, FailureCode]] = {
+    "slipped": FailureCode.SLIPPED,
+    "spilled": FailureCode.SPILLED,
+    "broken": FailureCode.BROKE,
+    "nothing": FailureCode.NOTHING_HAPPENED,
+    "locked": FailureCode.LOCKED,
+}
+OUTCOMES: Final = ("success", *CODES)
 DIFFICULTIES: Final = ("easy", "medium", "hard", "natural")
 
 
@@ -90,6 +100,17 @@ def load_contingency(name: str = "default") -> ContingencyConfig:
     if name not in files:
         raise ValueError(f"no contingency config {name!r}; allowed: {', '.join(sorted(files))}")
     return build(ContingencyConfig, yaml.safe_load(files[name].read_text(encoding="utf-8")), files[name].name)
+
+
+def subject_of(action: Action, held: str | None) -> str:
+    """Id of the object whose rule decides an action's outcome: what is put down or poured, else what the action names.
+
+    Args:
+        action: the action.
+        held: what its arm holds, or both do.
+    """
+    hands = action.spec.has_effect(PutDown) or action.spec.tool == "vessel"
+    return (held if hands else None) or action.object_id or ""
 
 
 def _uniform(seed: int, step: int, action: str, object_id: str) -> float:

@@ -19,7 +19,6 @@ import numpy as np
 
 from interface.actions import ActionKind
 from interface.bodies import Arm
-from interface.effects import PutDown
 from interface.episode import STEP_LIMIT
 from interface.facts import ObjectFacts
 from interface.feedback import ActionOutcome, Feedback
@@ -28,7 +27,7 @@ from interface.steps import Action, PlanStep
 from robots.build_solver import robot_kit
 from robots.spec import load_robot
 from sim.scene.objects import Placement
-from sim.session.contingency import Contingency, load_contingency
+from sim.session.contingency import Contingency, load_contingency, subject_of
 from sim.session.observation import observe
 from sim.skills.body.body import Body
 from sim.skills.body.ready import ready_posture
@@ -320,7 +319,8 @@ class Session:
         """The contingency of an action at the present step."""
         if self._certain:
             return "success"
-        object_id = _subject(self.body, action)
+        hands = self.body.hands
+        object_id = subject_of(action, hands.lifted if action.arm is None else hands.held[action.arm])
         obj = self.world.objects[object_id]
         state = {name: getattr(obj.state, name) for name in ("isFilledWithLiquid", "isToggled", "isDirty", "isBroken")}
         return self._contingency.draw(self.stats.steps, action.name, object_id, obj.type.name, state)
@@ -409,11 +409,3 @@ class Session:
         """Frees the drawing contexts of the running episode."""
         if self._opened:
             self.world.cameras.close()
-
-
-def _subject(body: Body, action: Action) -> str:
-    """Id of the object whose rule decides an action's outcome: what is put down or poured, else what the action names."""
-    held = None
-    if action.spec.has_effect(PutDown) or action.spec.tool == "vessel":
-        held = body.hands.lifted if action.arm is None else body.hands.held[action.arm]
-    return held or action.object_id or ""
