@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate
 from typing import Final
 
 from configs.schema.model import ModelConfig
@@ -63,13 +62,9 @@ class EpisodeLog:
 
     def _forget(self, kept: int) -> None:
         """Drops the oldest steps, the newest apart, until so many tokens are left."""
-        prefix, *steps = self.sizes
-        dropped = next(
-            (number for number, size in enumerate(accumulate(steps, initial=0)) if len(self.log) - size <= kept), len(steps)
-        )
-        dropped = min(dropped, len(steps) - 1)
-        if dropped > 0:
-            del self.log[prefix : prefix + sum(steps[:dropped])], self.sizes[1 : 1 + dropped]
+        prefix = self.sizes[0]
+        while len(self.log) > kept and len(self.sizes) > 2:
+            del self.log[prefix : prefix + self.sizes.pop(1)]
 
 
 def view_of(observation: Observation) -> View:
