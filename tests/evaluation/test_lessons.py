@@ -47,6 +47,17 @@ def test_an_episode_is_a_function_of_its_seed(episodes: list) -> None:
     assert episodes[5] != episodes[6]
 
 
+def test_some_episodes_are_told_from_a_later_step_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = {}
+    for share in (0.0, 1.0):
+        monkeypatch.setattr(lessons, "_LATE", share)
+        whole[share] = [Lessons().episode(seed) for seed in range(20)]
+    for first, late in zip(whole[0.0], whole[1.0], strict=True):
+        assert late.prefix == first.prefix and late.turns == first.turns[len(first.turns) - len(late.turns) :]
+    dropped = [len(first.turns) - len(late.turns) for first, late in zip(whole[0.0], whole[1.0], strict=True)]
+    assert min(dropped) >= 0 and len(set(dropped)) > 5
+
+
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four episodes of the simulator."""

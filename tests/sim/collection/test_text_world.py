@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from interface.actions import ACTIONS
+from interface.bodies import Arm
 from interface.observation import HistoryItem
 from interface.steps import Action, PlanStep
 from proprio_mllm.evaluation.lessons import WordsOnly
@@ -97,6 +98,20 @@ def test_what_breaks_stays_broken() -> None:
     for name in ("Mug_1", "DishSponge_1"):
         facts.harm(name, breaks=True)
     assert facts.object("Mug_1").broken and not facts.object("DishSponge_1").broken
+
+
+@pytest.mark.parametrize("puts", [True, False])
+def test_what_breaks_as_it_is_put_down_lies_there(puts: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(text_world.Contingency, "distribution", lambda *args: {"success": 0.0, "broken": 1.0})
+    rng, scene = np.random.default_rng(0), scene_of("kitchen_1")
+    world = TextWorld(Draft("p", "kitchen_1", {"Mug_1": "CounterTop_1"}, focus={"a": "Mug_1"}), scene, load_robot("h1"), rng)
+    state = world.facts.state
+    if puts:
+        del state.at["Mug_1"]
+        state.held[Arm.RIGHT] = "Mug_1"
+    action = Action.parse("Place(right, DiningTable_1)" if puts else "Pick(right, Mug_1)")
+    assert world._chance(action) == "Broke" and world.facts.object("Mug_1").broken
+    assert state.held[Arm.RIGHT] is None and state.at["Mug_1"] == ("DiningTable_1" if puts else "CounterTop_1")
 
 
 def test_food_cooks_in_a_pot_and_behind_a_door_that_is_shut() -> None:

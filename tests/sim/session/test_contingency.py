@@ -7,8 +7,9 @@ import pytest
 from scipy.stats import chisquare
 
 from configs.validate import ConfigError, build
+from interface.steps import Action
 from sim.session import contingency
-from sim.session.contingency import DIFFICULTIES, Contingency, ContingencyConfig, OutcomeRule, load_contingency
+from sim.session.contingency import DIFFICULTIES, Contingency, ContingencyConfig, OutcomeRule, load_contingency, subject_of
 
 FILLED = {"isFilledWithLiquid": True}
 CONFIG = load_contingency()
@@ -114,3 +115,18 @@ def test_observed_frequencies_match_the_file(rule: OutcomeRule) -> None:
     counts = np.array([draws.count(name) for name in rule.outcomes])
     assert counts.sum() == len(draws)
     assert chisquare(counts, len(draws) * np.array(list(rule.outcomes.values()))).pvalue > 0.001
+
+
+@pytest.mark.parametrize(
+    ("text", "held", "subject"),
+    [
+        ("Place(right, Bed_1)", "Mug_1", "Mug_1"),
+        ("PlaceBoth(Bed_1)", "Pot_1", "Pot_1"),
+        ("Pour(left, Bowl_1)", "Mug_1", "Mug_1"),
+        ("Clean(left, Bowl_1)", "DishSponge_1", "Bowl_1"),
+        ("Open(left, Drawer_1)", None, "Drawer_1"),
+        ("Place(right, Bed_1)", None, "Bed_1"),
+    ],
+)
+def test_whose_rule_decides(text: str, held: str | None, subject: str) -> None:
+    assert subject_of(Action.parse(text), held) == subject
