@@ -148,6 +148,7 @@ class AlignmentConfig:
         text: loop of phase 2a-i, motion and text; vision and CSE frozen.
         image: loop of phase 2a-ii, motion and image; vision frozen.
         joint: loop of phase 2b; rows, LoRA, CSE and merger train.
+        whole: whether the language model's own layers train in phase 2b too, as is of use where they were not pretrained.
         plan_share: share of a phase's batches that are of episodes: decisions with pictures and motion, episodes in words.
         text_share: share of episodes in words among them.
         judge_share: share of judging questions among the decisions.
@@ -166,6 +167,7 @@ class AlignmentConfig:
     questions: int = 6
     mask: float = 0.3
     go_back: float = 0.0
+    whole: bool = False
 
     def __post_init__(self) -> None:
         _require_shares(self, "plan_share", "text_share", "judge_share", "mask", "go_back")
@@ -317,6 +319,10 @@ class TrainConfig:
             f"model.places is learnt from point_map.encoder 'named', not {self.model.point_map.encoder!r}",
         )
         require(not self.shard or self.model.weights is not None, "shard=true shares a frozen backbone; set model.weights")
+        require(
+            not (self.alignment.whole and (self.shard or self.model.four_bit)),
+            "alignment.whole=true trains the language model's layers, which shard=true and model.four_bit=true freeze",
+        )
         require(not (self.shard and self.model.four_bit), "shard=true cannot share layers of 4 bits: leave out one of the two")
         require(
             self.given_alignment is None or self.given is not None,

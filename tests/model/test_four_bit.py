@@ -81,5 +81,7 @@ def test_what_it_goes_with() -> None:
         config()
     with pytest.raises(ValueError, match="cannot share layers of 4 bits"):
         config("model=qwen2_5_vl_7b", "shard=true")
+    with pytest.raises(ValueError, match=r"alignment\.whole=true trains the language model's layers, which .*four_bit=true"):
+        config("model=qwen2_5_vl_7b", "alignment.whole=true")
     told = footprint(config("model=qwen2_5_vl_7b", "budget=gpu", "recompute=true", "micro_batches=64"))
     assert 6 < told.gigabytes(1) < 12

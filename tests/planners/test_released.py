@@ -36,7 +36,6 @@ WEIGHTS = Path(__file__).parents[2] / "weights" / "tiny"
 PARTS = {
     "base": ("mrope", False, False),
     "full": ("rope_sign", True, True),
-    "full-alignment": ("rope_sign", True, True),
 }
 EPISODES = ["words", "practice", "base", "pointmap", "tokenizer", "alignment"]
 

@@ -16,7 +16,7 @@ from tools.publish import results
 
 ROOT = Path(__file__).parents[2]
 RESULTS = results()
-OLDER, BIT, SELU, FURTHER = (results(name) for name in ("physics_2", "bit", "selu_oracle", "continued"))
+OLDER, BIT, SELU, BEFORE, BLIND = (results(name) for name in ("physics_2", "bit", "selu_oracle", "before", "blind"))
 #: Planners of the published table, by the name of their row.
 PLANNERS = {
     "random legal actions (physics 2)": "random",
@@ -37,6 +37,12 @@ def percent(share: float) -> str:
 def counted(row: dict[str, Any], key: str, rate: str) -> str:
     low, high = (f"{100 * row[name]:.0f}" for name in (f"{rate}low", f"{rate}high"))
     return f"{row[key]}/{row['episodes']} = {percent(row[key] / row['episodes'])} [{low}, {high}]"
+
+
+def counts(result: dict[str, Any], category: str) -> str:
+    """Solved, in time, first tries."""
+    row = result["rows"][category]
+    return f"{row['successes']} | {row['in_time']} | {percent(row['first_try_rate'])}"
 
 
 def planner_row(label: str, result: dict[str, Any]) -> str:
@@ -141,30 +147,38 @@ def test_the_table_of_its_own_body() -> None:
 
 @pytest.mark.parametrize("robot", ["h1", "x1"])
 def test_the_table_of_learning_from_itself(robot: str) -> None:
-    runs = {"released model": RESULTS[f"proprio-{robot}-easy"], "after one round": SELU[f"proprio-{robot}-easy-essential"]}
+    runs = {"release before": BEFORE[f"proprio-{robot}-easy"], "after one round": SELU[f"proprio-{robot}-easy-essential"]}
     for label, run in runs.items():
-        row = run["rows"]["essential"]
-        cells = (str(row["successes"]), str(row["in_time"]), percent(row["first_try_rate"]))
-        assert f"| {label}, {robot.upper()} | {' | '.join(cells)} |" in LEARNT.splitlines()
+        assert f"| {label}, {robot.upper()} | {counts(run, 'essential')} |" in LEARNT.splitlines()
 
 
 @pytest.mark.parametrize("robot", ["h1", "x1"])
 def test_the_table_of_training_further(robot: str) -> None:
     name = f"proprio-{robot}-easy"
-    for label, run in (("released model", RESULTS[name]), ("trained further", FURTHER[name])):
-        row = run["rows"]["all"]
-        cells = (str(row["successes"]), str(row["in_time"]), percent(row["first_try_rate"]))
-        assert f"| {label}, {robot.upper()} | {' | '.join(cells)} |" in LEARNT.splitlines()
-    weights = {"full": RESULTS, "full-alignment": FURTHER}
-    for folder, runs in weights.items():
-        assert runs[name]["weights_digest"] == weights_digest(ROOT / "weights/tiny" / folder), "of the weights that are stored"
+    for label, run in (("release before", BEFORE[name]), ("trained further", RESULTS[name])):
+        assert f"| {label}, {robot.upper()} | {counts(run, 'all')} |" in LEARNT.splitlines()
+    assert RESULTS[name]["weights_digest"] == weights_digest(ROOT / "weights/tiny/full"), "of the weights that are stored"
+
+
+@pytest.mark.parametrize("robot", ["h1", "x1"])
+def test_what_seeing_and_feeling_bring(robot: str) -> None:
+    runs = [some[name] for some, name in ((RESULTS, f"proprio-{robot}-easy"), (BLIND, f"proprio-{robot}-easy-blind_both"))]
+    assert len({run["weights_digest"] for run in runs}) == 1
+    seeing, blind = (run["rows"]["all"] for run in runs)
+    column = 2 if robot == "h1" else 3
+    for label, key in (("success", "successes"), ("in time", "in_time")):
+        (line,) = (line for line in LEARNT.splitlines() if line.startswith(f"| {label} | ") and "p" in line)
+        cell = line.split("|")[column]
+        assert f"({seeing[key]} and {blind[key]})" in cell
+        assert f"{100 * (seeing[key] - blind[key]) / seeing['episodes']:+.1f} [" in cell
+    (line,) = (line for line in LEARNT.splitlines() if line.startswith("| first tries in reach | "))
+    shares = [100 * row["first_try_rate"] for row in (seeing, blind)]
+    assert f"({shares[0]:.1f} and {shares[1]:.1f} %)" in line.split("|")[column]
 
 
 def test_files_name_no_machine() -> None:
-    files = {**RESULTS, **{f"physics_2/{name}": one for name, one in OLDER.items()}, **BIT}
-    files |= {
-        f"{folder}/{name}": one for folder, some in (("selu", SELU), ("continued", FURTHER)) for name, one in some.items()
-    }
+    folders = {"": RESULTS, "physics_2/": OLDER, "bit/": BIT, "selu/": SELU, "before/": BEFORE, "blind/": BLIND}
+    files = {f"{folder}{name}": one for folder, some in folders.items() for name, one in some.items()}
     for name, result in files.items():
         assert re.fullmatch(r"python eval\.py( [\w.]+=[\w,.-]+)+", result["command"]), name
         assert len(result["solved"]) == len(result["in_time"]) == result["rows"]["all"]["episodes"]

@@ -64,7 +64,8 @@ class AlignmentStage:
         words = episodes_in_words(pipeline, model, f"{key}/words", turns)
         data = AlignmentData(model, tokenizer, clips, views, demos, turns, words, pipeline.cfg.alignment)
         for phase, about in phases.items():
-            train_only(model, about.groups)
+            own = ("lm",) if phase == "joint" and pipeline.cfg.alignment.whole else ()
+            train_only(model, (*about.groups, *own))
             objective = AlignmentObjective(model, data, phase, pipeline.cfg.alignment, f"{key}/{phase}")
             pipeline.loop(objective, getattr(pipeline.cfg.alignment, phase), folder / phase)
         if given is None and (share := pipeline.cfg.alignment.go_back):
