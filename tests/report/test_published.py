@@ -119,11 +119,12 @@ def test_the_table_of_replanning() -> None:
             assert in_time.strip() == str(row["in_time"])
 
 
-@pytest.mark.parametrize("planner", ["proprio", "base", "words", "scripted"])
+@pytest.mark.parametrize("planner", ["proprio", "blind", "base", "words", "scripted"])
 def test_the_table_of_one_bit(planner: str) -> None:
-    name = f"{planner}-h1-easy"
-    codes = RESULTS[name if name in RESULTS else f"{name}-essential"]
-    rows = [run["rows"]["essential"] for run in (codes, BIT[f"{name}-essential-bit"])]
+    name = "proprio" if planner == "blind" else planner
+    hidden, others = ("-blind_both", BLIND) if planner == "blind" else ("", RESULTS)
+    codes = next(others[one] for end in ("", "-essential") if (one := f"{name}-h1-easy{end}{hidden}") in others)
+    rows = [run["rows"]["essential"] for run in (codes, BIT[f"{name}-h1-easy-essential{hidden}-bit"])]
     cells = [
         cell
         for row in rows
@@ -133,8 +134,9 @@ def test_the_table_of_one_bit(planner: str) -> None:
             percent(row["first_try_rate"]),
         )
     ]
-    label = {name: label for label, name in PLANNERS.items()}.get(planner, "base model (before stage `alignment`)")
-    assert f"| {label} | {' | '.join(cells)} |" in BENCHMARK.splitlines()
+    labels = {name: label for label, name in PLANNERS.items()}
+    labels |= {"base": "base model (before stage `alignment`)", "blind": "Proprio-MLLM, picture and motion hidden"}
+    assert f"| {labels[planner]} | {' | '.join(cells)} |" in BENCHMARK.splitlines()
 
 
 def test_the_table_of_its_own_body() -> None:
