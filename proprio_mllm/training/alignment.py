@@ -4,7 +4,7 @@
 |---|---|---|---|
 | text (2a-i) | motion to text, to body state and back, masked motion, words | motion rows, LoRA | vision, merger, CSE |
 | image (2a-ii) | motion and image to text, motion to body state, replay | motion rows, LoRA, CSE, MPE | vision, merger |
-| joint (2b) | all of them | motion rows, LoRA, CSE, MPE, merger | vision, backbone |
+| joint (2b) | all of them | motion rows, LoRA, CSE, MPE, merger | vision, backbone unless `alignment.whole` |
 
 "Freeze the image and text weights separately" leaves open which weights; in this reading the vision tower stays as it is while
 motion meets text, and while motion and CSE meet images. LoRA trains throughout: what CSE adds to a visual token is of no use
@@ -62,6 +62,11 @@ PHASES: Final[Mapping[str, Phase]] = {
         ("say", "feel", "feel", "do", "fill", "say_image", "body", "body", "body", "body", "body", "body", "plan"),
     ),
 }
+
+
+def groups_of(phase: str, cfg: AlignmentConfig) -> tuple[str, ...]:
+    """What a phase trains; with `whole` the last one trains the language model's own layers too."""
+    return (*PHASES[phase].groups, *(("lm",) if cfg.whole and phase == "joint" else ()))
 
 
 class AlignmentData:

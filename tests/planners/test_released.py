@@ -99,7 +99,7 @@ def test_it_says_where_it_comes_from(name: str) -> None:
     for stage in note["stages"].values():
         assert stage["command"].startswith("python train.py stage=")
         assert stage["metrics"]["seconds"] > 0
-    assert note["variant"] == ("full" if name == "base" else name.removesuffix("-alignment"))
+    assert note["variant"] == ("full" if name == "base" else name)
 
 
 @pytest.mark.parametrize("name", ["words", *PARTS])

@@ -23,7 +23,7 @@ from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.tensors import read_tensors
 from proprio_mllm.training import release
-from proprio_mllm.training.alignment import PHASES, AlignmentObjective
+from proprio_mllm.training.alignment import PHASES, AlignmentObjective, groups_of
 from proprio_mllm.training.pipeline import Pipeline, StageError, variant_model
 from proprio_mllm.training.rollouts import DaggerRequest, RolloutRequest, read_rollouts, rollout_row
 from proprio_mllm.training.sources import Demos, shard_hash
@@ -149,6 +149,13 @@ def test_every_model_loads(trained: Pipeline) -> None:
         assert model.cfg.proprioception is proprioception
         assert model.cfg.weights is None
         assert (model.cse is not None) is proprioception
+
+
+@pytest.mark.parametrize("phase", list(PHASES))
+def test_the_last_phase_may_train_the_whole_language_model(trained: Pipeline, phase: str) -> None:
+    cfg = trained.cfg.alignment
+    own = set(groups_of(phase, dataclasses.replace(cfg, whole=True))) - set(groups_of(phase, cfg))
+    assert own == ({"lm"} if phase == "joint" else set()) and groups_of(phase, cfg) == PHASES[phase].groups
 
 
 @pytest.mark.parametrize("phase", list(PHASES))

@@ -18,7 +18,7 @@ from proprio_mllm.model.building import (
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
-from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, body_state_accuracy
+from proprio_mllm.training.alignment import PHASES, AlignmentData, AlignmentObjective, body_state_accuracy, groups_of
 from proprio_mllm.training.base import grounding_accuracy
 from proprio_mllm.training.pipeline import Metrics, Pipeline, seeded, variant_model
 from proprio_mllm.training.sources import Clips, Views, asked_by
@@ -47,11 +47,11 @@ class AlignmentStage:
 
         A released one is stored as it is and not measured again, or goes through the last phase once more.
         """
-        given, phases = pipeline.given(self.name), PHASES
+        given, phases = pipeline.given(self.name), tuple(PHASES)
         if given is None:
             model = start(pipeline)
         else:
-            model, phases = load_model(given), {"joint": PHASES["joint"]}
+            model, phases = load_model(given), ("joint",)
             pipeline.fits(given, model.cfg, _config(pipeline))
             if not pipeline.continues(self.name):
                 pipeline.store("alignment", model, MotionTokenizer.load(given / "motion") if model.cfg.proprioception else None)
@@ -63,9 +63,8 @@ class AlignmentStage:
         turns = turns_of(pipeline, model, demos, read)
         words = episodes_in_words(pipeline, model, f"{key}/words", turns)
         data = AlignmentData(model, tokenizer, clips, views, demos, turns, words, pipeline.cfg.alignment)
-        for phase, about in phases.items():
-            own = ("lm",) if phase == "joint" and pipeline.cfg.alignment.whole else ()
-            train_only(model, (*about.groups, *own))
+        for phase in phases:
+            train_only(model, groups_of(phase, pipeline.cfg.alignment))
             objective = AlignmentObjective(model, data, phase, pipeline.cfg.alignment, f"{key}/{phase}")
             pipeline.loop(objective, getattr(pipeline.cfg.alignment, phase), folder / phase)
         if given is None and (share := pipeline.cfg.alignment.go_back):
