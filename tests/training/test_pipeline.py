@@ -373,7 +373,8 @@ def test_released_parts_are_taken_and_not_trained(trained: Pipeline, tmp_path: P
     whole = dataclasses.replace(onward.cfg, alignment=dataclasses.replace(cfg.alignment, whole=True), overwrite=True)
     assert Pipeline(STAGES, whole, collect, "", correct, Lessons()).run("alignment") is not None
     learnt = load_model(onward.paths.model("alignment")).state_dict()
-    assert any(".layers." in name and "lora" not in name and not torch.allclose(theirs[name], learnt[name]) for name in learnt)
+    moved = {name for name, tensor in learnt.items() if not torch.allclose(theirs[name], tensor, atol=1e-3)}
+    assert any("language_model.layers" in name and "lora" not in name for name in moved), moved
     with pytest.raises(ValueError, match="given_alignment=taken takes from `given`, which is not set"):
         dataclasses.replace(trained.cfg, given_alignment="taken")
 
