@@ -267,7 +267,8 @@ class TrainConfig:
             point map and the motion tokenizer are taken from there, where it has them, in place of being trained. None trains
             everything.
         given_alignment: what alignment makes of the variant's model from there: it is `taken` as it is, so that `stage=selu`
-            goes on from a released one, or `continued` by phase `joint` alone. None trains it from `base`.
+            goes on from a released one, or `continued` by phase `joint` alone, where a variant or a seed that is not there goes
+            on from the full model, without the variant's parts. None trains it from `base`.
         resume: continue an interrupted stage from its checkpoint.
         data: where motions come from, and what is kept of them.
         collect: what the simulator writes before training.

@@ -301,13 +301,16 @@ def write_stored(folder: Path, stored: Mapping[str, Any]) -> None:
     (folder / "config.json").write_text(text + "\n", encoding="utf-8")
 
 
-def load_model(folder: str | Path, adapter: str | None = None, trainable: bool = False) -> ProprioMLLM:
+def load_model(
+    folder: str | Path, adapter: str | None = None, trainable: bool = False, cfg: ModelConfig | None = None
+) -> ProprioMLLM:
     """Reads what `save_model` wrote, in evaluation mode.
 
     Args:
         folder: the stored model.
         adapter: the adapter to make active; by default the first, if any.
         trainable: whether adapters keep their gradients.
+        cfg: the stored configuration with parts switched off, whose weights are left out; by default all of it.
 
     Raises:
         DamagedFileError: when a file of it is not what was written.
@@ -318,7 +321,7 @@ def load_model(folder: str | Path, adapter: str | None = None, trainable: bool =
     if stored.get("format") != _FORMAT:
         raise ValueError(f"{folder}: model format {stored.get('format')!r}; this version reads {_FORMAT}")
     check_files(folder, stored.get("files", {}))
-    cfg = build(ModelConfig, stored["config"], "model")
+    cfg = cfg or build(ModelConfig, stored["config"], "model")
     processor = load_processor(folder / "processor", cfg.image_size)
     local = dataclasses.replace(cfg, weights=str(_backbone(folder, stored))) if cfg.weights is None else cfg
     model = build_model(local, processor)

@@ -201,8 +201,10 @@ class Pipeline:
             raise StageError(
                 f"given={self.cfg.given}: no folder {released}; it is where released weights are, such as `weights`"
             )
-        folder = released / names[stage]
-        return folder if folder.is_dir() else None
+        folders = [released / names[stage]]
+        if stage == "alignment" and self.cfg.given_alignment == "continued":
+            folders.append(released / "full")  # whose parts a variant leaves out
+        return next((folder for folder in folders if folder.is_dir()), None)
 
     def fits(self, given: Path, has: object, wanted: object) -> None:
         """Holds what released weights are of against the configuration.

@@ -370,6 +370,13 @@ def test_released_parts_are_taken_and_not_trained(trained: Pipeline, tmp_path: P
     moved = {name for name, tensor in learnt.state_dict().items() if not torch.allclose(theirs[name], tensor, atol=1e-3)}
     assert moved and all(any(part in name for part in ("lora", "trainable", "cse", "merger", "mpe")) for name in moved), moved
     assert [path.name for path in release.export(onward, tmp_path / "weights")] == ["full-alignment"]
+    without = dataclasses.replace(onward.cfg, variant="no_mpe_cse", seed=5, shared_seed=cfg.seed, stage="alignment")
+    assert Pipeline(STAGES, without, collect, "", correct, Lessons()).run("alignment") is not None
+    ablated = load_model(onward.paths.root / "no_mpe_cse-5" / "alignment" / "model")
+    assert ablated.cse is None and ablated.point_map is None and ablated.cfg.mpe.mode == "mrope"
+    assert set(ablated.state_dict()) < set(theirs), "what it goes on from is the full model"
+    close = [torch.allclose(theirs[name], tensor, atol=1e-3) for name, tensor in ablated.state_dict().items()]
+    assert not all(close) and sum(close) > len(close) / 2
     whole = dataclasses.replace(onward.cfg, alignment=dataclasses.replace(cfg.alignment, whole=True), overwrite=True)
     assert Pipeline(STAGES, whole, collect, "", correct, Lessons()).run("alignment") is not None
     learnt = load_model(onward.paths.model("alignment")).state_dict()

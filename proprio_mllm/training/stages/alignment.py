@@ -45,14 +45,18 @@ class AlignmentStage:
     def run(self, pipeline: Pipeline, folder: Path, key: str) -> Metrics:
         """Trains and stores the variant's model, and measures grounding, body state and planning.
 
-        A released one is stored as it is and not measured again, or goes through the last phase once more.
+        A released one is stored as it is and not measured again, or goes through the last phase once more: the variant's own,
+        or the full model's without the variant's parts.
         """
         given, phases = pipeline.given(self.name), tuple(PHASES)
         if given is None:
             model = start(pipeline)
         else:
             model, phases = load_model(given), ("joint",)
-            pipeline.fits(given, model.cfg, _config(pipeline))
+            owner, variant = "full" if given.name == "full" else pipeline.cfg.variant, pipeline.cfg.variant
+            pipeline.fits(given, model.cfg, _config(pipeline, owner))
+            if owner != variant:
+                model = load_model(given, cfg=_config(pipeline, variant))
             if not pipeline.continues(self.name):
                 pipeline.store("alignment", model, MotionTokenizer.load(given / "motion") if model.cfg.proprioception else None)
                 return {}
@@ -79,7 +83,7 @@ class AlignmentStage:
 
 def start(pipeline: Pipeline) -> ProprioMLLM:
     """The base model with this variant's MPE and CSE and the trained point map."""
-    cfg = _config(pipeline)
+    cfg = _config(pipeline, pipeline.cfg.variant)
     point_map = point_map_of(pipeline, cfg) if cfg.cse.enabled else None
     if cfg.weights is None:
         base = load_model(pipeline.paths.model("base"))
@@ -92,6 +96,6 @@ def start(pipeline: Pipeline) -> ProprioMLLM:
     return model
 
 
-def _config(pipeline: Pipeline) -> ModelConfig:
-    """The variant's."""
-    return dataclasses.replace(variant_model(pipeline.cfg.model, pipeline.cfg.variant), sees=True)
+def _config(pipeline: Pipeline, variant: str) -> ModelConfig:
+    """A variant's."""
+    return dataclasses.replace(variant_model(pipeline.cfg.model, variant), sees=True)
