@@ -301,6 +301,22 @@ def write_stored(folder: Path, stored: Mapping[str, Any]) -> None:
     (folder / "config.json").write_text(text + "\n", encoding="utf-8")
 
 
+def stored_config(folder: str | Path) -> ModelConfig:
+    """The configuration of a stored model, read without its weights.
+
+    Raises:
+        ValueError: on an unknown format.
+    """
+    return build(ModelConfig, _stored(Path(folder))["config"], "model")
+
+
+def _stored(folder: Path) -> dict[str, Any]:
+    stored: dict[str, Any] = read_json(folder / "config.json")
+    if stored.get("format") != _FORMAT:
+        raise ValueError(f"{folder}: model format {stored.get('format')!r}; this version reads {_FORMAT}")
+    return stored
+
+
 def load_model(
     folder: str | Path, adapter: str | None = None, trainable: bool = False, cfg: ModelConfig | None = None
 ) -> ProprioMLLM:
@@ -317,9 +333,7 @@ def load_model(
         ValueError: on an unknown format or adapter, or when a shared backbone is missing or another one.
     """
     folder = Path(folder)
-    stored = read_json(folder / "config.json")
-    if stored.get("format") != _FORMAT:
-        raise ValueError(f"{folder}: model format {stored.get('format')!r}; this version reads {_FORMAT}")
+    stored = _stored(folder)
     check_files(folder, stored.get("files", {}))
     cfg = cfg or build(ModelConfig, stored["config"], "model")
     processor = load_processor(folder / "processor", cfg.image_size)

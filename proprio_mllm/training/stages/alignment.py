@@ -14,6 +14,7 @@ from proprio_mllm.model.building import (
     build_processor,
     go_back,
     load_model,
+    stored_config,
 )
 from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
@@ -52,11 +53,9 @@ class AlignmentStage:
         if given is None:
             model = start(pipeline)
         else:
-            model, phases = load_model(given), ("joint",)
-            owner, variant = "full" if given.name == "full" else pipeline.cfg.variant, pipeline.cfg.variant
-            pipeline.fits(given, model.cfg, _config(pipeline, owner))
-            if owner != variant:
-                model = load_model(given, cfg=_config(pipeline, variant))
+            owner = "full" if given.name == "full" else pipeline.cfg.variant
+            pipeline.fits(given, stored_config(given), _config(pipeline, owner))
+            model, phases = load_model(given, cfg=_config(pipeline, pipeline.cfg.variant)), ("joint",)
             if not pipeline.continues(self.name):
                 pipeline.store("alignment", model, MotionTokenizer.load(given / "motion") if model.cfg.proprioception else None)
                 return {}
