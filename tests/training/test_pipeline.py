@@ -371,7 +371,12 @@ def test_released_parts_are_taken_and_not_trained(trained: Pipeline, tmp_path: P
     assert moved and all(any(part in name for part in ("lora", "trainable", "cse", "merger", "mpe")) for name in moved), moved
     assert [path.name for path in release.export(onward, tmp_path / "weights")] == ["full-alignment"]
     without = dataclasses.replace(onward.cfg, variant="no_mpe_cse", seed=5, shared_seed=cfg.seed, stage="alignment")
-    assert Pipeline(STAGES, without, collect, "", correct, Lessons()).run("alignment") is not None
+    ablation = Pipeline(STAGES, without, collect, "", correct, Lessons())
+    own_loop = ablation.loop
+    monkeypatch.setattr(ablation, "loop", lambda objective, *rest: loops.append(objective.name) or own_loop(objective, *rest))
+    assert ablation.run("alignment") is not None and loops == 2 * ["alignment/joint"], "base was not gone back to"
+    absent = Pipeline(STAGES, dataclasses.replace(without, given_alignment="taken"), collect, "", correct, Lessons())
+    assert absent.given("alignment") is None, "the full model is not taken for an ablation as it is"
     ablated = load_model(onward.paths.root / "no_mpe_cse-5" / "alignment" / "model")
     assert ablated.cse is None and ablated.point_map is None and ablated.cfg.mpe.mode == "mrope"
     assert set(ablated.state_dict()) < set(theirs), "what it goes on from is the full model"
