@@ -69,7 +69,7 @@ def main(arguments: Sequence[str]) -> int:
     folders, options = read_named(Options, arguments, ("RUN",), more=True)
     for folder in map(Path, folders):
         target = FOLDER / options.below / f"{folder.resolve().name.rpartition('-')[0]}.json"
-        target.parent.mkdir(exist_ok=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
         write_text(target, json.dumps(published(load_run(folder)), indent=1) + "\n")
         sys.stdout.write(f"{target}\n")
     return 0

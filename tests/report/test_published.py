@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from data.files import read_json
 from proprio_mllm.evaluation.run import weights_digest
-from proprio_mllm.report.statistics import compare, wilson
+from proprio_mllm.report.paper import paper_ablation
+from proprio_mllm.report.statistics import trained_interval, wilson
 from sim.scene.compiler import PHYSICS
-from tools.publish import results
+from tools.publish import FOLDER, results
 
 ROOT = Path(__file__).parents[2]
 RESULTS = results()
-OLDER, BIT, SELU, BEFORE, BLIND = (results(name) for name in ("physics_2", "bit", "selu_oracle", "before", "blind"))
+BIT, SELU, BEFORE, BLIND = (results(name) for name in ("bit", "selu_oracle", "before", "blind"))
+#: By seed.
+ABLATIONS = [results(f"ablations/{seed}") for seed in range(3)]
 #: Planners of the published table, by the name of their row.
 PLANNERS = {
-    "random legal actions (physics 2)": "random",
+    "random legal actions": "random",
     "Proprio-MLLM": "proprio",
     "language model, words alone": "words",
     "scripted rules": "scripted",
@@ -62,8 +67,7 @@ def planner_row(label: str, result: dict[str, Any]) -> str:
 @pytest.mark.parametrize("label", PLANNERS)
 @pytest.mark.parametrize("robot", ["h1", "x1"])
 def test_the_table_of_planners(label: str, robot: str) -> None:
-    source = OLDER if label.endswith("(physics 2)") else RESULTS
-    assert planner_row(label, source[f"{PLANNERS[label]}-{robot}-easy"]) in BENCHMARK.splitlines()
+    assert planner_row(label, RESULTS[f"{PLANNERS[label]}-{robot}-easy"]) in BENCHMARK.splitlines()
 
 
 def test_no_other_planner_is_in_the_table() -> None:
@@ -81,28 +85,51 @@ def test_the_table_of_the_readme(planner: str) -> None:
     assert row.endswith(f" | {shares[0]} | {shares[1]} |")
 
 
-def pairs(name: str, other: str = "proprio-h1-easy") -> tuple[int, int, float]:
-    """Tasks that one solves and the other does not, the reverse, and the p-value."""
-    first, second = ({str(k): [float(digit)] for k, digit in enumerate(OLDER[one]["solved"])} for one in (name, other))
-    compared = compare(first, second)
-    return len(compared.above), len(compared.below), compared.p_value
+#: Planners of the ablations, by the variant that they run.
+VARIANTS = {
+    "full": "proprio",
+    "no_mpe": "proprio_no_mpe",
+    "no_cse": "proprio_no_cse",
+    "no_mpe_cse": "proprio_no_mpe_cse",
+    "no_proprio": "no_proprio",
+}
 
 
-@pytest.mark.parametrize("planner", ["proprio_no_cse", "proprio_no_mpe", "proprio_no_mpe_cse", "no_proprio", "base"])
-def test_the_table_of_ablations(planner: str) -> None:
-    result = OLDER[f"{planner}-h1-easy"]
-    every, essential = result["rows"]["all"], result["rows"]["essential"]
-    (line,) = (line for line in BENCHMARK.splitlines() if line.startswith(f"| `{planner}` "))
-    won, lost, p_value = pairs(f"{planner}-h1-easy")
-    cells = [cell.strip() for cell in line.split("|")[2:-1]]
-    assert cells[:2] == [f"{every['successes']}/359", str(every["in_time"])]
-    told = re.fullmatch(r"(\d+), (\d+) \(p = ([\d.]+)\)", cells[2])
-    assert (
-        told is not None and (int(told[1]), int(told[2])) == (won, lost) and float(told[3]) == pytest.approx(p_value, abs=0.006)
-    )
-    assert cells[3] == f"{100 * every['first_try_rate']:.1f} %"
-    assert cells[4] == f"{essential['successes']}/133"
-    assert cells[5] == f"{essential['navigation']} / {essential['body_adjustment']} / {essential['logical']}"
+def trainings(variant: str) -> list[dict[str, Any]]:
+    """A variant's published runs, one per seed."""
+    return [one[f"{VARIANTS[variant]}-h1-easy-essential"] for one in ABLATIONS]
+
+
+def ablation_cells(variant: str) -> list[list[str]]:
+    """Of the variant's row in the table of counts and, but for the full model, in the table of differences."""
+    lines = [line for line in BENCHMARK.splitlines() if line.startswith(f"| `{variant}` | ")]
+    return [[cell.strip() for cell in line.split("|")[2:-1]] for line in lines]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_ablations_counts(variant: str) -> None:
+    rows = [run["rows"]["all"] for run in trainings(variant)]
+    told = [", ".join(str(row[key]) for row in rows) for key in ("successes", "in_time")]
+    told.append(", ".join(f"{100 * row['first_try_rate']:.1f}" for row in rows))
+    told.append(" / ".join(str(sum(row[key] for row in rows)) for key in ("navigation", "body_adjustment", "logical")))
+    assert ablation_cells(variant)[0] == told
+    assert len({run["weights_digest"] for run in trainings(variant)}) == len(rows)
+
+
+@pytest.mark.parametrize("variant", [name for name in VARIANTS if name != "full"])
+def test_the_ablations_differences(variant: str) -> None:
+    with (FOLDER / "ablations" / f"{VARIANTS[variant]}.csv").open(encoding="utf-8", newline="") as file:
+        compared = [row for row in csv.DictReader(file) if row["category"] == "all"]
+    cells = ablation_cells(variant)[1]
+    assert cells[:-1] == [f"{row['difference']} {row['95 % interval']}" for row in compared]
+    for key, row in zip(("solved", "in_time"), compared, strict=False):
+        sides = [np.array([[(float(digit), 1.0) for digit in run[key]] for run in trainings(one)]) for one in ("full", variant)]
+        told = [float(number) for number in re.findall(r"[-+\d.]+", f"{row['difference']} {row['95 % interval']}")]
+        assert told == pytest.approx([100 * value for value in trained_interval(*sides)], abs=0.5)  # tasks in another order
+    paper = paper_ablation()
+    without = {"no_mpe": "without MPE", "no_cse": "without CSE", "no_mpe_cse": "without both"}.get(variant)
+    lost = without and paper["Proprio-MLLM"]["success_percent"] - paper[without]["success_percent"]
+    assert cells[-1] == (f"{lost:+.1f}" if lost else "")
 
 
 def test_the_table_of_replanning() -> None:
@@ -181,10 +208,11 @@ def test_what_seeing_and_feeling_bring(robot: str) -> None:
 
 
 def test_files_name_no_machine() -> None:
-    folders = {"": RESULTS, "physics_2/": OLDER, "bit/": BIT, "selu/": SELU, "before/": BEFORE, "blind/": BLIND}
+    folders = {"": RESULTS, "bit/": BIT, "selu/": SELU, "before/": BEFORE, "blind/": BLIND}
+    folders |= {f"ablations/{seed}/": one for seed, one in enumerate(ABLATIONS)}
     files = {f"{folder}{name}": one for folder, some in folders.items() for name, one in some.items()}
     for name, result in files.items():
         assert re.fullmatch(r"python eval\.py( [\w.]+=[\w,.-]+)+", result["command"]), name
         assert len(result["solved"]) == len(result["in_time"]) == result["rows"]["all"]["episodes"]
         assert result["solved"].count("1") == result["rows"]["all"]["successes"]
-        assert result["physics"] == (2 if name.startswith("physics_2/") else PHYSICS)
+        assert result["physics"] == PHYSICS
