@@ -207,9 +207,11 @@ def distribution_figures(cfg: ExperimentConfig, runs: Sequence[Run], folder: Pat
             axes.boxplot([steps for _, steps in won], tick_labels=labels, medianprops={"color": _COLOURS["body_adjustment"]})
             axes.tick_params(axis="x", labelsize=8)
             axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-            axes.set_ylim(bottom=0)
         else:
             _say_empty(axes)
+    top = max(axes.get_ylim()[1] for axes in panels)
+    for axes in panels:  # bodies side by side, on one scale
+        axes.set_ylim(0, top)
     used = [run for group in shown.values() for run in group]
     source = f"Box: quartiles; line: median; whiskers: 1.5 quartile ranges. {_runs_source(used)}"
     return [*files, save_figure(figure, folder / "steps_distribution.png", source)]

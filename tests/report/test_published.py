@@ -22,6 +22,7 @@ RESULTS = results()
 BIT, SELU, BEFORE, BLIND = (results(name) for name in ("bit", "selu_oracle", "before", "blind"))
 #: By seed.
 ABLATIONS = [results(f"ablations/{seed}") for seed in range(3)]
+LONGER = results("ablations/240_steps")
 #: Planners of the published table, by the name of their row.
 PLANNERS = {
     "random legal actions": "random",
@@ -100,6 +101,12 @@ def trainings(variant: str) -> list[dict[str, Any]]:
     return [one[f"{VARIANTS[variant]}-h1-easy-essential"] for one in ABLATIONS]
 
 
+def differences(name: str) -> list[dict[str, str]]:
+    """Figures of all categories together, one training kind minus another."""
+    with (FOLDER / "ablations" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+        return [row for row in csv.DictReader(file) if row["category"] == "all"]
+
+
 def ablation_cells(variant: str) -> list[list[str]]:
     """Of the variant's row in the table of counts and, but for the full model, in the table of differences."""
     lines = [line for line in BENCHMARK.splitlines() if line.startswith(f"| `{variant}` | ")]
@@ -116,10 +123,20 @@ def test_the_ablations_counts(variant: str) -> None:
     assert len({run["weights_digest"] for run in trainings(variant)}) == len(rows)
 
 
+def test_what_motion_tokens_bring() -> None:
+    _, in_time, first_tries, *_ = (f"{row['difference']} {row['95 % interval']}" for row in differences("motion_tokens"))
+    assert f" is {in_time} in time, {first_tries} of first tries." in BENCHMARK
+
+
+def test_the_ablation_that_trained_longer() -> None:
+    row = LONGER["no_proprio-h1-easy-essential"]["rows"]["all"]
+    told = f"solves {row['successes']}, {row['in_time']} in time, with {100 * row['first_try_rate']:.1f} % of first tries"
+    assert told in BENCHMARK
+
+
 @pytest.mark.parametrize("variant", [name for name in VARIANTS if name != "full"])
 def test_the_ablations_differences(variant: str) -> None:
-    with (FOLDER / "ablations" / f"{VARIANTS[variant]}.csv").open(encoding="utf-8", newline="") as file:
-        compared = [row for row in csv.DictReader(file) if row["category"] == "all"]
+    compared = differences(VARIANTS[variant])
     cells = ablation_cells(variant)[1]
     assert cells[:-1] == [f"{row['difference']} {row['95 % interval']}" for row in compared]
     for key, row in zip(("solved", "in_time"), compared, strict=False):
@@ -209,7 +226,7 @@ def test_what_seeing_and_feeling_bring(robot: str) -> None:
 
 def test_files_name_no_machine() -> None:
     folders = {"": RESULTS, "bit/": BIT, "selu/": SELU, "before/": BEFORE, "blind/": BLIND}
-    folders |= {f"ablations/{seed}/": one for seed, one in enumerate(ABLATIONS)}
+    folders |= {f"ablations/{seed}/": one for seed, one in enumerate(ABLATIONS)} | {"ablations/240_steps/": LONGER}
     files = {f"{folder}{name}": one for folder, some in folders.items() for name, one in some.items()}
     for name, result in files.items():
         assert re.fullmatch(r"python eval\.py( [\w.]+=[\w,.-]+)+", result["command"]), name
