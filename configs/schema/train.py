@@ -73,10 +73,10 @@ class BaseConfig:
         dense: loop of the dense, name-tied pretraining of the vision tower.
         joint: loop of the mixed batches.
         questions: question and answer pairs packed per image.
-        plan_share: share of the joint batches that are of episodes: decisions with pictures, episodes in words, judging
-            questions.
+        plan_share: share of the joint batches that are of episodes: decisions with pictures, episodes in words, questions
+            about the states of objects.
         text_share: share of episodes in words among them.
-        judge_share: share of judging questions and phrases among the others.
+        judge_share: share of questions about states, and of phrases, among the others.
         dense_weight: weight of the dense loss on the joint batches' views.
     """
 
@@ -151,7 +151,7 @@ class AlignmentConfig:
         whole: whether the language model's own layers train in phase 2b too, as is of use where they were not pretrained.
         plan_share: share of a phase's batches that are of episodes: decisions with pictures and motion, episodes in words.
         text_share: share of episodes in words among them.
-        judge_share: share of judging questions among the decisions.
+        judge_share: share of questions about the states of objects among the decisions.
         questions: body-relative questions packed per image.
         mask: share of motion tokens hidden in masked motion.
         go_back: how far the language model's layers are taken back at the end to what they were before stage `base`, or before
@@ -185,8 +185,8 @@ class SeluConfig:
         critic: loop of the critic's fine-tuning.
         actor: loop of the actor's fine-tuning.
         truth: `audit` only reports the critic against the simulator; `oracle` lets the simulator judge (a labelled ablation).
-        replay_share: share of the batches that is replayed against forgetting: for the actor decisions of lessons, for
-            the critic judging questions.
+        replay_share: share of the batches that is replayed against forgetting: decisions of lessons, for the critic
+            questions about lessons too.
         per_class: most kept trajectories per verb, robot and category.
         precision: share of the critic's yes to held-out questions that must be right for its yes to count; 0 counts it always.
         rollouts: who runs them.

@@ -20,7 +20,7 @@ Style = Literal["terse", "full"]
 
 _SYSTEM: dict[str, dict[Style, str]] = {
     "look": {"terse": "look", "full": "You answer questions about what the robot sees, relative to its own body."},
-    "judge": {"terse": "judge", "full": "You judge whether a robot reached its goal, from its camera view and its log."},
+    "judge": {"terse": "judge", "full": "You tell what has come of a robot's work, from its camera view and its log."},
     "move": {"terse": "move", "full": "You read and write the robot's motion as motion tokens."},
 }
 
@@ -116,25 +116,6 @@ def filled_motion(masked: Sequence[int | None], motion: Sequence[int], style: St
     """Masked motion: None in `masked` is hidden; the answer is the whole window."""
     ask = "fill " if style == "terse" else "Fill in the hidden tokens: "
     return with_answer((_system("move", style), Message("user", f"{ask}{motion_text(masked)}")), motion_text(motion))
-
-
-def critic_prompt(
-    goal: str,
-    visible: Sequence[str],
-    history: Sequence[HistoryItem],
-    motion: Sequence[int] | None = None,
-    style: Style = "terse",
-    last: int = 8,
-) -> tuple[Message, ...]:
-    """Was the goal completed? The reply is `yes` or `no`."""
-    if style == "terse":
-        text = f"{_body(motion, style)}see {_ids(visible, style)}\ndid\n{last_steps(history, last, style)}\n{goal}?"
-    else:
-        text = (
-            f"{_body(motion, style)}In view: {_ids(visible, style)}\nLog:\n{last_steps(history, last, style)}\n"
-            f'Was the goal "{goal}" completed? Answer yes or no.'
-        )
-    return (_system("judge", style), Message("user", text, images=1))
 
 
 def self_ask_prompt(

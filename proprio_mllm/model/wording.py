@@ -310,6 +310,11 @@ def answer_words(verb: str, target: str | None, step: PlanStep, reflection: Word
     return (*reflection, verb, *thing, *place, "do", *actions, END)
 
 
+def verdict_words(done: bool) -> Words:
+    """What a critic answers where a planner would say the step: that the goals hold, as planners say it, or to go on."""
+    return answer_words("Done", "", PlanStep((Action("Done"),))) if done else ("again", END)
+
+
 def read_step(words: Sequence[str], ids: Mapping[Words, str]) -> PlanStep:
     """The step of an answer, the inverse of `answer_words`.
 

@@ -36,7 +36,7 @@ from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, body_state_prompt, described_motion, filled_motion, made_motion
 from proprio_mllm.training.asking import answer_shares
 from proprio_mllm.training.base import EPISODE_ROWS, looking_around
-from proprio_mllm.training.judging import judge_example
+from proprio_mllm.training.judging import state_example
 from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.phrases import body_state_words
 from proprio_mllm.training.sources import Clips, Demos, Views, grips_of
@@ -107,7 +107,7 @@ class AlignmentData:
 
     def _examples(self, kind: Kind, rng: np.random.Generator, size: int) -> list[Example]:
         if kind == "judge":
-            return [judge_example(self.demos, int(i), rng, self.turns.codes) for i in self.demos.draw(rng, size)]
+            return [state_example(self.demos, int(i), rng, self.turns.codes) for i in self.demos.draw(rng, size)]
         if kind == "body":
             return [self._body(int(i), rng) for i in rng.choice(self.views.split.train, size)]
         if kind == "feel":

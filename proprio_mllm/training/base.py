@@ -22,7 +22,7 @@ from proprio_mllm.model.dense import DenseHead, shown_shares
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.prompts import looking
 from proprio_mllm.training.asking import answer_shares
-from proprio_mllm.training.judging import judge_example
+from proprio_mllm.training.judging import state_example
 from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.phrases import phrase
 from proprio_mllm.training.sources import CELL, GROUNDING, Clips, Demos, ViewRow, Views, asked_by
@@ -164,7 +164,7 @@ class JointObjective(_Base):
             parts = self._turns.batch(rng, max(1, size // EPISODE_ROWS))
             return Parts(_JointBatch(kind, part, None, None, 0.0) for part in parts)
         examples = [
-            phrase(self._clips, rng, self._demos.style) if rng.random() < PHRASES else judge_example(self._demos, i, rng, None)
+            phrase(self._clips, rng, self._demos.style) if rng.random() < PHRASES else state_example(self._demos, i, rng, None)
             for i in self._demos.draw(rng, size)
         ]
         return Parts(_JointBatch(kind, part, None, None, 0.0) for part in self._collator.in_parts(examples))

@@ -1,13 +1,13 @@
 """The critic of SELU: judges goals, asks itself about states, and turns trajectories into its own and the actor's examples.
 
-The critic is the same model under another LoRA adapter. It reads the last view, the log and the motion tokens of a moment; the
-simulator's truth reaches it only in the labelled ablation `truth=oracle`. Formats and filters that the abstract of SELU leaves
-open are ours: judging every moment to cut a trajectory at its first success, dropping failed steps as targets, caps per class.
+The critic is the same model under another LoRA adapter. It reads the view, the log and the motion tokens of a moment as a
+planner does, and says `Done` where the goal holds; the simulator's truth reaches it only in the labelled ablation
+`truth=oracle`. Formats and filters that the abstract of SELU leaves open are ours: cutting a trajectory at the first moment at
+which a rewritten goal holds, dropping failed steps as targets, caps per class.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -17,19 +17,18 @@ from typing import Literal
 import numpy as np
 
 from interface.actions import ActionKind
-from interface.sightings import Shown
 from interface.steps import Action, PlanStep
 from proprio_mllm.model.batch import Example
 from proprio_mllm.model.building import use_adapter
 from proprio_mllm.model.chat import Message
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.observing import EpisodeLog, pictured_turn
-from proprio_mllm.model.prompts import Style, answers, critic_prompt, self_ask_prompt, with_answer
+from proprio_mllm.model.prompts import Style, answers, self_ask_prompt
 from proprio_mllm.model.word_tokens import tokens_of
-from proprio_mllm.model.wording import answer_words, reflection_words
+from proprio_mllm.model.wording import answer_words, reflection_words, verdict_words
 from proprio_mllm.training.asking import replies
 from proprio_mllm.training.goals import VERBS, Relabel, relabel, verbs_of
-from proprio_mllm.training.judging import LOG_LENGTH
+from proprio_mllm.training.judging import LOG_LENGTH, verdict_example
 from proprio_mllm.training.rollouts import Rollout
 
 Motion = Sequence[int] | None
@@ -84,20 +83,25 @@ class ModelJudge(Judge):
 
     def __init__(self, model: ProprioMLLM, adapter: str = "critic") -> None:
         self._model, self._adapter = model, adapter
-        self._style: Style = model.cfg.prompt
+        self._said: dict[tuple[str, int, str], bool] = {}
 
     def completed(self, queries: Sequence[tuple[Trajectory, int, str]]) -> list[bool]:
-        """Greedy replies; anything but `yes` is no."""
-        return self.agrees([Example(judge_prompt(t, at, goal, self._style), (t.rollout.view(at),)) for t, at, goal in queries])
+        """Whether it says that it is done; any other word is no. It is asked once and remembers what it said."""
+        asked = {(t.rollout.episode, at, goal): (t, at, goal) for t, at, goal in queries}
+        new = {key: verdict(self._model, *query) for key, query in asked.items() if key not in self._said}
+        self._said |= zip(new, self.agrees(list(new.values())), strict=True)
+        return [self._said[t.rollout.episode, at, goal] for t, at, goal in queries]
 
     def agrees(self, asked: Sequence[Example]) -> list[bool]:
-        """Whether it says yes to conversations that ask for it."""
-        return [reply.lower().startswith("yes") for reply in self._reply(asked, 4)]
+        """Whether it says that it is done in `judging.verdict_example`s without their answers."""
+        done = verdict_words(True)[0]
+        length = len(tokens_of(self._model.processor.tokenizer).tokens([done]))
+        return [reply == done for reply in self._reply(asked, length)]
 
     def ask(self, trajectory: Trajectory, relation: str) -> str:
         """Greedy reply to a self-asked question."""
         at = trajectory.rollout.length
-        example = Example(ask_prompt(trajectory, relation, self._style), (trajectory.rollout.view(at),))
+        example = Example(ask_prompt(trajectory, relation, self._model.cfg.prompt), (trajectory.rollout.view(at),))
         return self._reply([example], 24)[0]
 
     def _reply(self, asked: Sequence[Example], tokens: int) -> list[str]:
@@ -132,10 +136,9 @@ class OracleJudge(Judge):
         return answers([name for name in (rollout.relations or {}).get(relation, ()) if name in known])
 
 
-def judge_prompt(t: Trajectory, at: int, goal: str, style: Style) -> tuple[Message, ...]:
-    """`critic_prompt` about a moment."""
-    moment = t.rollout.moments[at]
-    return critic_prompt(goal, moment.visible, t.rollout.history(at), t.motion[at], style, LOG_LENGTH)
+def verdict(model: ProprioMLLM, t: Trajectory, at: int, goal: str, done: bool | None = None) -> Example:
+    """`judging.verdict_example` about a moment."""
+    return verdict_example(model, t.rollout.shown(at, goal), t.rollout.view(at), t.motion[at], done)
 
 
 def ask_prompt(t: Trajectory, relation: str, style: Style) -> tuple[Message, ...]:
@@ -145,14 +148,14 @@ def ask_prompt(t: Trajectory, relation: str, style: Style) -> tuple[Message, ...
 
 
 def critic_examples(
-    trajectories: Sequence[Trajectory], judge: Judge, style: Style, goals: dict[tuple[str, str], Relabel]
+    model: ProprioMLLM, trajectories: Sequence[Trajectory], judge: Judge, goals: dict[tuple[str, str], Relabel]
 ) -> list[CriticExample]:
     """Judges, asks itself and relabels.
 
     Args:
+        model: that the examples are for.
         trajectories: this round's.
         judge: the critic.
-        style: of the prompts.
         goals: receives the relabelled goals by (episode, goal).
 
     Returns:
@@ -161,33 +164,33 @@ def critic_examples(
     """
     examples: list[CriticExample] = []
 
-    def add(kind: Literal["direct", "relabel", "negative"], t: Trajectory, goal: str, answer: str) -> None:
-        end = t.rollout.length
-        messages = with_answer(judge_prompt(t, end, goal, style), answer)
-        examples.append(CriticExample(kind, t.rollout.episode, Example(messages, (t.rollout.view(end),))))
+    def add(kind: Literal["direct", "relabel", "negative"], t: Trajectory, goal: str) -> None:
+        example = verdict(model, t, t.rollout.length, goal, kind != "negative")
+        examples.append(CriticExample(kind, t.rollout.episode, example))
 
     verdicts = judge.completed([(t, t.rollout.length, t.rollout.instruction) for t in trajectories])
     for t, done in zip(trajectories, verdicts, strict=True):
         rollout = t.rollout
         if done:
-            add("direct", t, rollout.instruction, "yes")
+            add("direct", t, rollout.instruction)
             continue
-        add("negative", t, rollout.instruction, "no")
+        add("negative", t, rollout.instruction)
         ask = functools.partial(judge.ask, t)
         found = relabel(rollout.instruction, rollout.moments[-1].known, rollout.receptacles(), ask, (rollout.instruction,))
         if found is None:
             continue
         goals[rollout.episode, found.goal] = found
         if judge.completed([(t, rollout.length, found.goal)])[0]:
-            add("relabel", t, found.goal, "yes")
+            add("relabel", t, found.goal)
     return examples
 
 
 def keep(
     trajectories: Sequence[Trajectory], goals: Mapping[tuple[str, str], Relabel], judge: Judge, per_class: int
 ) -> list[Kept]:
-    """Re-judges original and relabelled goals; positives are cut at the first moment that the judge accepts.
+    """Re-judges original and relabelled goals.
 
+    An episode ends by itself when its own goal holds; under another it is cut at the first moment that the judge accepts.
     Duplicates (same robot, goal and steps) are dropped; at most `per_class` per verbs, robot and category are kept, in order.
     """
     candidates = [(t, t.rollout.instruction, False) for t in trajectories]
@@ -200,8 +203,8 @@ def keep(
     for (t, goal, relabelled), done in zip(candidates, verdicts, strict=True):
         if not done or t.rollout.length == 0:
             continue
-        # A goal can only come true through a step that worked.
-        moments = [at for at in range(1, t.rollout.length) if t.rollout.moments[at - 1].ok]
+        # A goal can only come true through the work of an arm.
+        moments = [at for at in range(1, t.rollout.length) if relabelled and _worked(t.rollout, at - 1)]
         flags = judge.completed([(t, at, goal) for at in moments])
         end = next((at for at, held in zip(moments, flags, strict=True) if held), t.rollout.length)
         steps = tuple(moment.step for moment in t.rollout.moments[:end])
@@ -226,9 +229,8 @@ def actor_examples(model: ProprioMLLM, kept: Sequence[Kept]) -> list[Example]:
     for number, item in enumerate(kept):
         t, rollout = item.trajectory, item.trajectory.rollout
         log = EpisodeLog(tokens_of(model.processor.tokenizer), reflects=number % 2 == 0)  # as half of the lessons
-        for at in range(item.end):
-            moment, history = rollout.moments[at], tuple(rollout.history(at))
-            now = log.look(Shown(item.goal, rollout.robot, moment.visible, moment.known, history))
+        for at, shown in enumerate(rollout.shown(item.end - 1, item.goal)):
+            moment, now = rollout.moments[at], log.look(shown)
             served = next((action for later in range(at, item.end) for action in _worked(rollout, later)), None)
             if not moment.ok or served is None or moment.step == "Done()" or _stays(rollout, at):
                 continue
@@ -257,11 +259,10 @@ def _stays(rollout: Rollout, at: int) -> bool:
     return before is not None and before.ok and before.step == now.step and now.step.startswith("GoTo(")
 
 
-def precision(judge: ModelJudge, asked: Sequence[Example]) -> float:
-    """Of the yes of a critic to conversations with their answers, the share that is right; 0 when it never says yes."""
-    right = [one.messages[-1].text == "yes" for one in asked]
-    said = judge.agrees([dataclasses.replace(one, messages=one.messages[:-1]) for one in asked])
-    return float(np.mean([truth for truth, yes in zip(right, said, strict=True) if yes])) if any(said) else 0.0
+def precision(judge: ModelJudge, asked: Sequence[tuple[Example, bool]]) -> float:
+    """Of a critic's yes to questions, each with what is true, the share that is right; 0 when it never says yes."""
+    said = judge.agrees([question for question, _ in asked])
+    return float(np.mean([truth for (_, truth), yes in zip(asked, said, strict=True) if yes])) if any(said) else 0.0
 
 
 def audit(trajectories: Sequence[Trajectory], goals: Mapping[tuple[str, str], Relabel], judge: Judge) -> dict[str, float]:

@@ -1,83 +1,116 @@
-"""Judging questions from the logs of lessons: was the goal completed, and which objects are in a state.
+"""What a critic is asked, with answers from logs: does the goal hold, and which objects are in a state.
 
-A released model can answer such questions; the tiny one has to learn it. The answers come from what the log itself says (an
-action with `ok`, or the end of a successful episode), never from privileged simulator state, so a judge learns to
-read its inputs only.
+Whether a goal holds is asked in the words in which planners are shown an episode: a planner that has learnt when it is done
+knows most of it. The answers come from what the log itself says (an action with `ok`, or the end of a successful episode),
+never from privileged simulator state, so a critic learns to read its inputs only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Iterable, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from proprio_mllm.model.batch import Example
-from proprio_mllm.model.prompts import answers, critic_prompt, self_ask_prompt, with_answer
+from interface.sightings import Shown
+from proprio_mllm.model.batch import Example, View
+from proprio_mllm.model.modeling import ProprioMLLM
+from proprio_mllm.model.observing import EpisodeLog, pictured_turn
+from proprio_mllm.model.prompts import answers, self_ask_prompt, with_answer
+from proprio_mllm.model.word_tokens import tokens_of
+from proprio_mllm.model.wording import verdict_words
 from proprio_mllm.training.sources import Demos
 from proprio_mllm.training.states import asked_relation, history_of, states_from_log
 
-#: Earlier steps shown to a judge.
+#: Earlier steps shown with a question about states.
 LOG_LENGTH: Final = 8
+#: How often a held-out moment that is asked about is its episode's end, and how often the goal there is another's.
+_ENDED, _OTHER = 0.5, 0.3
 
 
-def judge_example(demos: Demos, index: int, rng: np.random.Generator, tokens: NDArray[np.int64] | None) -> Example:
-    """A judging conversation about the state before step `index`, with its answer.
+def verdict_example(
+    model: ProprioMLLM, shown: Iterable[Shown], view: View | None, codes: Sequence[int] | None, done: bool | None = None
+) -> Example:
+    """Whether the goal that was shown holds at the last moment.
 
-    Half of them ask whether a goal was completed: the episode's own, which is so at its end only, or another episode's
-    instruction; the others ask which objects are in a relation.
+    Args:
+        model: gives the tokenizer, and says whether it sees.
+        shown: every moment of the episode so far.
+        view: of the last moment.
+        codes: its motion tokens, None without proprioception.
+        done: the answer; None leaves it open.
+    """
+    log, now = EpisodeLog(tokens_of(model.processor.tokenizer)), list[int]()
+    for moment in shown:
+        now = log.look(moment)
+    answer = () if done is None else log.words.tokens(verdict_words(done))
+    return pictured_turn(model, log.log, now, view if model.cfg.sees else None, codes, answer)
+
+
+def state_example(demos: Demos, index: int, rng: np.random.Generator, tokens: NDArray[np.int64] | None) -> Example:
+    """Which objects are in a relation before step `index`, with the answer.
 
     Args:
         demos: steps of lessons.
-        index: a training row.
-        rng: draws the question, and whether the end of another episode is asked about.
+        index: a row.
+        rng: draws the relation.
         tokens: motion tokens (rows, tokens) of all rows, None leaves proprioception out.
     """
-    ended = rng.random() < 0.6 and len(demos.finals) > 0
-    if ended:
-        index = int(rng.choice(demos.finals))
     row = demos.reader[int(index)]
-    motion = None if tokens is None else tokens[int(index)].tolist()
-    if rng.random() < 0.5:
-        return _completion_example(demos, row, ended, demos.finals, rng, motion)
     history = history_of(row)
     states = states_from_log(history[-LOG_LENGTH:])
     relation = asked_relation(states, rng)
+    motion = None if tokens is None else tokens[int(index)].tolist()
     prompt = self_ask_prompt(relation, row["visible"], history, motion, demos.style, LOG_LENGTH)
     return Example(with_answer(prompt, answers(states[relation])), (demos.view(row),))
 
 
-def completion_examples(demos: Demos, count: int, tokens: NDArray[np.int64] | None) -> list[Example]:
-    """Held-out conversations whether a goal was completed, the same every time; half of them are at an episode's end.
+class Verdicts:
+    """Questions about lessons, whether a goal holds.
 
     Args:
+        model: see `verdict_example`.
         demos: steps of lessons.
-        count: how many; none when nothing is held out.
         tokens: motion tokens of all rows, or None.
     """
-    rng, held_out = np.random.default_rng(0), demos.split.test
-    finals, others = np.intersect1d(demos.ends, held_out), np.setdiff1d(held_out, demos.ends)
-    found: list[Example] = []
-    for ended in (rng.random(count if len(held_out) else 0) < 0.5) & (len(finals) > 0):
-        index = int(rng.choice(finals if ended else others))
-        motion = None if tokens is None else tokens[index].tolist()
-        found.append(_completion_example(demos, demos.reader[index], bool(ended), finals, rng, motion))
-    return found
 
+    def __init__(self, model: ProprioMLLM, demos: Demos, tokens: NDArray[np.int64] | None) -> None:
+        self._model, self._demos, self._tokens = model, demos, tokens
+        test = np.isin(demos.ends, demos.split.test)
+        self._ends = {True: demos.ends[test], False: demos.ends[~test]}
 
-def _completion_example(
-    demos: Demos,
-    row: Mapping[str, Any],
-    ended: bool,
-    finals: NDArray[np.int64],
-    rng: np.random.Generator,
-    motion: Sequence[int] | None,
-) -> Example:
-    """Whether a goal was completed; at the end of an episode the goal is another's now and then, drawn from `finals`."""
-    goal, done = row["instruction"], ended
-    if ended and rng.random() < 0.3:
-        other = demos.reader[int(rng.choice(finals))]["instruction"]
-        done, goal = other == goal, other
-    prompt = critic_prompt(goal, row["visible"], history_of(row), motion, demos.style, LOG_LENGTH)
-    return Example(with_answer(prompt, "yes" if done else "no"), (demos.view(row),))
+    def draw(self, rng: np.random.Generator) -> Example:
+        """Whether an episode that is learnt from has met another's goal, with the answer: what no planner has learnt to say."""
+        index = int(rng.choice(self._ends[False]))
+        return self._example(index, *self._other(index, rng))
+
+    def held_out(self, count: int) -> list[tuple[Example, bool]]:
+        """Questions about rows that are held out, the same every time, and what is true; none when nothing is held out.
+
+        Half of them are about the end of an episode, and some of these about another's goal.
+        """
+        rng, rows, ends = np.random.default_rng(0), self._demos.split.test, self._ends[True]
+        before = np.setdiff1d(rows, ends)
+        found: list[tuple[Example, bool]] = []
+        for _ in range(count if len(rows) else 0):
+            ended = len(ends) > 0 and rng.random() < _ENDED
+            index = int(rng.choice(ends if ended else before))
+            asked = self._goal(index), bool(ended)
+            if ended and rng.random() < _OTHER:
+                asked = self._other(index, rng)
+            found.append((self._example(index, asked[0], None), asked[1]))
+        return found
+
+    def _goal(self, index: int) -> str:
+        return str(self._demos.reader[index]["instruction"])
+
+    def _other(self, index: int, rng: np.random.Generator) -> tuple[str, bool]:
+        """The goal of an episode of the same part, and whether it is this one's too."""
+        goal = self._goal(int(rng.choice(self._ends[bool(np.isin(index, self._ends[True]))])))
+        return goal, goal == self._goal(index)
+
+    def _example(self, index: int, goal: str, done: bool | None) -> Example:
+        codes = None if self._tokens is None else self._tokens[index].tolist()
+        view = self._demos.view(self._demos.reader[index])
+        return verdict_example(self._model, self._demos.shown(index, goal), view, codes, done)

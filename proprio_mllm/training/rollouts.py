@@ -24,6 +24,7 @@ from configs.schema.execution import Execution
 from data.motion import KEY_BODY_COUNT
 from data.shards import ShardReader, decode_motion, decode_png, encode_png
 from interface.observation import Camera, HistoryItem, Observation
+from interface.sightings import Shown
 from proprio_mllm.model.batch import View
 
 
@@ -118,6 +119,14 @@ class Rollout:
     def history(self, index: int) -> list[HistoryItem]:
         """Steps before observation `index`."""
         return [HistoryItem(moment.step, moment.feedback) for moment in self.moments[:index]]
+
+    def shown(self, index: int, goal: str) -> list[Shown]:
+        """What a planner with a goal would have seen, up to observation `index`."""
+        history = tuple(self.history(index))
+        return [
+            Shown(goal, self.robot, moment.visible, moment.known, history[:at])
+            for at, moment in enumerate(self.moments[: index + 1])
+        ]
 
     def view(self, index: int) -> View:
         """The head-camera view of observation `index`."""

@@ -24,11 +24,13 @@ from configs.schema.model import ModelConfig
 from data.motion import HAND_OPENING, KEY_BODY_COUNT, OPEN_HAND
 from data.shards import Manifest, ShardError, ShardReader, decode_depth, decode_motion, decode_png, decode_segmentation
 from interface.observation import Camera
+from interface.sightings import Shown
 from proprio_mllm.model.batch import View
 from proprio_mllm.model.geometry import unproject
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.model.prompts import Style, answers
 from proprio_mllm.model.questions import ANSWERS, ask, spoken
+from proprio_mllm.training.states import history_of
 
 #: One in this many views, episodes and clips is never trained on.
 HELD_OUT = 20
@@ -194,9 +196,8 @@ class Demos:
         self.starts = [row for row, name in enumerate(names) if row == 0 or name != names[row - 1]]
         self.split = _Split(names, folder)
         self.motions = np.stack([decode_motion(m) for m in self.reader.column("motion")])  # (N, T, F)
-        #: Rows at which the goals of an episode were met, and those of them that are for training.
+        #: Rows at which the goals of an episode were met.
         self.ends = np.flatnonzero(np.asarray(self.reader.column("target")) == "Done()")
-        self.finals = np.intersect1d(self.ends, self.split.train)
         self.style: Style = cfg.prompt
         labels = np.char.add(np.asarray(self.reader.column("category")), np.asarray(self.reader.folder_of(), dtype=str))
         labels = labels[self.split.train]
@@ -213,6 +214,12 @@ class Demos:
             newest = self.motions[:, -tokenizer.cfg.window :]
             parts = [torch.from_numpy(newest[i : i + 256]) for i in range(0, len(newest), 256)]
             return torch.cat([tokenizer.encode(part) for part in parts]).cpu().numpy()
+
+    def shown(self, index: int, goal: str) -> list[Shown]:
+        """What a planner with a goal would have seen of a row's episode, up to that row."""
+        start = self.starts[int(np.searchsorted(self.starts, index, side="right")) - 1]
+        rows = [self.reader[row] for row in range(start, index + 1)]
+        return [Shown(goal, row["robot"], tuple(row["visible"]), tuple(row["known"]), tuple(history_of(row))) for row in rows]
 
     def view(self, row: Mapping[str, Any]) -> View:
         """The head-camera view of a row."""

@@ -16,7 +16,7 @@ from configs.schema.model import ModelConfig
 from interface.actions import ACTIONS
 from proprio_mllm.model.chat import render
 from proprio_mllm.model.modeling import ProprioMLLM
-from proprio_mllm.model.prompts import critic_prompt, looking, self_ask_prompt
+from proprio_mllm.model.prompts import looking, self_ask_prompt
 from proprio_mllm.model.word_tokens import tokens_of
 from proprio_mllm.model.wording import MARKERS, PLACE_SCALES, name_words
 from proprio_mllm.training.phrases import phrase
@@ -50,8 +50,7 @@ def corpus(
         asked = views.asked(row, (*GROUNDING, *BODY_RELATIVE), 10, rng)
         pairs = [views.listing(row), *((one.question, one.answer) for one in asked)]
         texts.append(render(looking(pairs, None, cfg.prompt)))
-    texts.append(render(critic_prompt("pick up the mug", (), (), None, cfg.prompt)) + " yes no none")
-    texts.append(render(self_ask_prompt("held", (), (), None, cfg.prompt)) + " open closed on off in lifted")
+    texts.append(render(self_ask_prompt("held", (), (), None, cfg.prompt)) + " none open closed on off in lifted")
     return texts
 
 

@@ -24,7 +24,7 @@ from proprio_mllm.model.batch import Collator, Example, View
 from proprio_mllm.model.building import build_model, build_processor
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.processor import ProprioProcessor
-from proprio_mllm.model.prompts import critic_prompt, with_answer
+from proprio_mllm.model.prompts import self_ask_prompt, with_answer
 
 TYPES = ("Mug", "Fridge", "CoffeeMachine", "Pan", "Pancake")
 TEXTS = [
@@ -91,7 +91,7 @@ def make_view(rng: np.random.Generator) -> View:
 def make_example(rng: np.random.Generator, known: int = 3, answer: str = "Pick(left, Mug_1)", felt: bool = True) -> Example:
     names = [f"Pan_{n}" for n in range(1, known + 1)]
     motion = [int(code) for code in rng.integers(0, 16, 4)]
-    prompt = critic_prompt("put the mug into the fridge", names, [], motion if felt else None)
+    prompt = self_ask_prompt("open", names, [], motion if felt else None)
     return Example(with_answer(prompt, answer), (make_view(rng),))
 
 

@@ -132,16 +132,15 @@ def test_processor_loads_the_legacy_layout(processor, tmp_path):
 
 
 def test_full_prompts_say_the_same():
-    text = prompts.critic_prompt("tidy up", ["Mug_1"], [], [1], "full")[1].text
-    for part in ("tidy up", "Mug_1", "<motion_1>", "nothing yet"):
+    text = prompts.self_ask_prompt("open", ["Mug_1"], [], [1], "full")[1].text
+    for part in ("Mug_1", "<motion_1>", "nothing yet"):
         assert part in text
-    assert "yes or no" in prompts.critic_prompt("tidy up", [], [], style="full")[1].text
     assert "which open?" in prompts.self_ask_prompt("open", [], [])[1].text
     assert "are open?" in prompts.self_ask_prompt("open", [], [], style="full")[1].text
     assert prompts.answers([]) == "none"
     assert prompts.answers(["A_1", "B_1"]) == "A_1, B_1"
     with pytest.raises(ValueError, match="style 'loud'"):
-        prompts.critic_prompt("x", [], [], style="loud")
+        prompts.self_ask_prompt("x", [], [], style="loud")
 
 
 def test_packed_questions_and_motion_exercises(cfg, processor, examples):

@@ -18,10 +18,9 @@ from configs.validate import build
 from proprio_mllm.evaluation.lessons import Lessons
 from proprio_mllm.model.batch import Example
 from proprio_mllm.model.building import build_model, build_processor
-from proprio_mllm.model.chat import Message
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.word_tokens import add_word_tokens, known_words
-from proprio_mllm.model.wording import id_words, read_step
+from proprio_mllm.model.wording import id_words, read_step, text_words
 from proprio_mllm.training import asking, critic
 from proprio_mllm.training.critic import (
     Judge,
@@ -35,7 +34,7 @@ from proprio_mllm.training.critic import (
     keep,
 )
 from proprio_mllm.training.goals import Relabel
-from proprio_mllm.training.judging import completion_examples, judge_example
+from proprio_mllm.training.judging import Verdicts, state_example
 from proprio_mllm.training.pipeline import base_model_config
 from proprio_mllm.training.rollouts import Moment, Rollout
 from proprio_mllm.training.sources import Demos
@@ -89,14 +88,22 @@ def reader() -> ProprioMLLM:
     return build_model(cfg, processor, 0)
 
 
+def words_in(model: ProprioMLLM, example: Example, learnt: bool) -> list[str]:
+    """The words of a sequence that are learnt, or those that are read."""
+    words = {token: word for word, token in known_words(model.processor.tokenizer).items()}
+    assert example.tokens is not None
+    pairs = zip(example.tokens.ids, example.tokens.targets, strict=True)
+    return [words.get(token, "?") for token, target in pairs if target is learnt]
+
+
+def learnt_words(model: ProprioMLLM, examples: Sequence[Example]) -> list[list[str]]:
+    """The answers of sequences."""
+    return [words_in(model, example, True) for example in examples]
+
+
 def taught_words(model: ProprioMLLM, kept: Sequence[Kept]) -> list[list[str]]:
     """The answers that the actor is to learn."""
-    words, found = {token: word for word, token in known_words(model.processor.tokenizer).items()}, list[list[str]]()
-    for example in actor_examples(model, kept):
-        assert example.tokens is not None
-        pairs = zip(example.tokens.ids, example.tokens.targets, strict=True)
-        found.append([words[token] for token, target in pairs if target])
-    return found
+    return learnt_words(model, actor_examples(model, kept))
 
 
 def taught(model: ProprioMLLM, kept: Sequence[Kept]) -> list[str]:
@@ -114,11 +121,12 @@ def test_relabelling_and_truncation(reader: ProprioMLLM) -> None:
     plate = "Pick up the plate."
     judge = Scripted({("a", 2, "Pick up the mug."), ("b", 3, plate), ("b", 4, plate)}, "Plate_1")
     goals: dict[tuple[str, str], Relabel] = {}
-    examples = critic_examples([good, wrong], judge, "terse", goals)
-    assert [(one.kind, one.episode, one.example.messages[-1].text) for one in examples] == [
-        ("direct", "a", "yes"),
-        ("negative", "b", "no"),
-        ("relabel", "b", "yes"),
+    examples = critic_examples(reader, [good, wrong], judge, goals)
+    assert [(one.kind, one.episode) for one in examples] == [("direct", "a"), ("negative", "b"), ("relabel", "b")]
+    assert learnt_words(reader, [one.example for one in examples]) == [
+        ["Done", "do", "Done", "."],
+        ["again", "."],
+        ["Done", "do", "Done", "."],
     ]
     assert list(goals) == [("b", plate)]
     kept = keep([good, wrong], goals, judge, 10)
@@ -139,11 +147,13 @@ def test_a_hallucinated_yes_lowers_precision() -> None:
 
 
 def test_a_goal_comes_true_through_a_step_that_worked() -> None:
-    """Right after the failed step, and before the first one, nobody asks."""
-    pick, whole = "Pick up the plate.", trajectory("b", PICK_PLATE, "Pick up the plate.", True)
+    """After a walk, a failed step or before the first one nobody asks; an episode's own goal comes true at its end."""
+    pick = "Pick up the plate."
     always = {("b", at, pick) for at in range(5)}
-    ends = [keep([whole], {}, Scripted(always - {("b", at, pick) for at in nos}), 10)[0].end for nos in ((), (1,), (1, 3))]
-    assert ends == [1, 3, 4]
+    wrong, goals = trajectory("b", PICK_PLATE, "Pick up the mug.", False), {("b", pick): Relabel(pick, (), ())}
+    ends = [keep([wrong], goals, Scripted(always - {("b", at, pick) for at in nos}), 10)[0].end for nos in ((), (1,), (3,))]
+    assert ends == [3, 3, 4]
+    assert keep([trajectory("b", PICK_PLATE, pick, True)], {}, Scripted(always), 10)[0].end == 4
 
 
 def test_the_oracle_knows_the_end_alone() -> None:
@@ -162,8 +172,10 @@ def test_the_oracle_knows_the_end_alone() -> None:
     assert [oracle.ask(picked, relation) for relation in ("held", "open")] == ["Plate_1", "none"]
 
 
-def test_the_model_answers_every_question_under_the_critics_adapter(monkeypatch: pytest.MonkeyPatch) -> None:
-    told, sizes, adapters = iter(["Yes.", " no", "yes", "perhaps", "No, yes", "Plate_1"]), list[tuple[int, int]](), list[str]()
+def test_the_model_answers_every_question_under_the_critics_adapter(
+    reader: ProprioMLLM, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told, sizes, adapters = iter([" Done", " again", "Done", " Pick", " done", "Plate_1"]), list[tuple[int, int]](), list[str]()
 
     class Batch(list[Example]):
         def to(self, device: str) -> Batch:
@@ -176,30 +188,27 @@ def test_the_model_answers_every_question_under_the_critics_adapter(monkeypatch:
     monkeypatch.setattr(critic, "use_adapter", lambda model, name: adapters.append(name))
     monkeypatch.setattr(asking, "Collator", lambda processor, cfg: lambda examples, generation: Batch(examples))
     monkeypatch.setattr(asking, "_BATCH", 2)
-    model = SimpleNamespace(cfg=SimpleNamespace(prompt="terse"), processor=None, device="cpu", reply=reply)
+    model = SimpleNamespace(cfg=reader.cfg, processor=reader.processor, device="cpu", reply=reply)
     model.eval = lambda: model
     judge = ModelJudge(cast(ProprioMLLM, model))
     whole = trajectory("b", PICK_PLATE, "Pick up the mug.", False)
-    assert judge.completed([(whole, at, "Pick up the mug.") for at in range(5)]) == [True, False, True, False, False]
-    assert [size for size, _ in sizes] == [2, 2, 1]
+    for _ in range(2):
+        assert judge.completed([(whole, at, "Pick up the mug.") for at in range(5)]) == [True, False, True, False, False]
+    assert [size for size, _ in sizes] == [2, 2, 1]  # nothing is asked twice
     assert judge.ask(whole, "held") == "Plate_1"
     assert sizes[-1][0] == 1 and sizes[-1][1] > sizes[0][1]  # ids are longer than a yes
     assert set(adapters) == {"critic"}
 
 
 def test_precision_is_of_the_yes_alone() -> None:
-    def told(*answers: str) -> list[Example]:
-        return [Example((Message("user", "?"), Message("assistant", answer))) for answer in answers]
-
     class Said(ModelJudge):
         def __init__(self, *said: bool) -> None:
             self.said = list(said)
 
         def agrees(self, asked: Sequence[Example]) -> list[bool]:
-            assert all(one.messages[-1].role == "user" for one in asked), "the answer is not shown"
             return self.said
 
-    asked = told("yes", "no", "yes", "yes", "no")
+    asked = [(Example(), truth) for truth in (True, False, True, True, False)]
     assert critic.precision(Said(True, True, True, False, False), asked) == pytest.approx(2 / 3)
     assert critic.precision(Said(*[False] * 5), asked) == 0.0
 
@@ -240,24 +249,44 @@ def demos(shards: Path, cfg: ModelConfig) -> Demos:
     return Demos(shards / "lessons", cfg)
 
 
-def test_judging_exercises_have_both_answers(demos: Demos) -> None:
+def goal_in(model: ProprioMLLM, example: Example) -> list[str]:
+    """The words of the goal that a question is about."""
+    words = words_in(model, example, False)
+    return words[1 : words.index("room")]
+
+
+def spoken(model: ProprioMLLM, goal: str) -> list[str]:
+    """A goal as `words_in` reads it."""
+    known = known_words(model.processor.tokenizer)
+    return [word if word in known else "?" for word in text_words(goal)]
+
+
+def test_an_episode_is_asked_whether_it_met_the_goal_of_another(demos: Demos, reader: ProprioMLLM) -> None:
+    rng, verdicts = np.random.default_rng(0), Verdicts(reader, demos, None)
+    found = [verdicts.draw(rng) for _ in range(100)]
+    answers = [answer[0] for answer in learnt_words(reader, found)]
+    assert set(answers) == {"Done", "again"} and min(map(answers.count, answers)) > 10
+    instructions = [spoken(reader, text) for text in demos.reader.column("instruction")]
+    for example, answer in zip(found, answers, strict=True):
+        words = words_in(reader, example, False)
+        assert goal_in(reader, example) in instructions
+        assert words[-1] == "do"
+        if answer == "Done":
+            assert "Pick left" in " ".join(words[words.index("did") : words.index("now")])
+
+
+def test_questions_about_states_are_answered_with_ids(demos: Demos) -> None:
     rng = np.random.default_rng(0)
-    found = [judge_example(demos, int(rng.choice(demos.split.train)), rng, None) for _ in range(200)]
-    replies = [example.messages[-1].text for example in found]
-    assert replies.count("yes") > 10
-    assert replies.count("no") > 10
-    assert any(reply.endswith("_1") for reply in replies)
-    done = next(example for example in found if example.messages[-1].text == "yes")
-    assert "Pick(left" in done.messages[1].text
+    found = [state_example(demos, int(rng.choice(demos.split.train)), rng, None).messages[-1].text for _ in range(100)]
+    assert "none" in found and any(reply.endswith("_1") for reply in found)
 
 
-def test_held_out_questions_are_of_episodes_that_no_training_sees(demos: Demos) -> None:
-    asked, again = completion_examples(demos, 60, None), completion_examples(demos, 60, None)
-    assert [one.messages for one in asked] == [one.messages for one in again]
-    told = {one.messages[-1].text for one in asked}
-    assert told == {"yes", "no"}
+def test_held_out_questions_are_of_episodes_that_no_training_sees(demos: Demos, reader: ProprioMLLM) -> None:
+    asked, again = (Verdicts(reader, demos, None).held_out(60) for _ in range(2))
+    assert [(one.tokens, truth) for one, truth in asked] == [(one.tokens, truth) for one, truth in again]
+    assert {truth for _, truth in asked} == {True, False}
+    assert not any(learnt_words(reader, [one for one, _ in asked]))  # the answer is not shown
     rows = [demos.reader[int(index)] for index in demos.split.test]
-    views = {demos.view(row).image.tobytes() for row in rows}
-    assert all(one.views[0].image.tobytes() in views for one in asked)
-    done = {row["instruction"] for row in rows if row["target"] == "Done()"}
-    assert all(any(goal in one.messages[1].text for goal in done) for one in asked if one.messages[-1].text == "yes")
+    goals = [spoken(reader, row["instruction"]) for row in rows]
+    done = [spoken(reader, row["instruction"]) for row in rows if row["target"] == "Done()"]
+    assert all(goal_in(reader, one) in (done if truth else goals) for one, truth in asked)

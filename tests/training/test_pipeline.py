@@ -90,8 +90,8 @@ def test_own_episodes_follow_the_teachers(trained: Pipeline) -> None:
     targets = joined.reader.column("target")
     assert targets[:count] == alone.reader.column("target")
     assert targets[count:] == targets[:12]
-    assert all(targets[int(i)] == "Done()" for i in joined.finals)
-    assert {joined.reader[i]["episode"] for i in joined.finals} > {alone.reader[i]["episode"] for i in alone.finals}
+    assert all(targets[int(i)] == "Done()" for i in joined.ends)
+    assert {joined.reader[i]["episode"] for i in joined.ends} > {alone.reader[i]["episode"] for i in alone.ends}
 
 
 def test_the_control_trains_without_motion(trained: Pipeline) -> None:

@@ -34,7 +34,7 @@ class AlignmentStage:
     name = "alignment"
     needs = ("base", "practice", "pointmap", "tokenizer")
     shards = ("lessons",)
-    recipe = 20
+    recipe = 21
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The phases, the variant's model, and whether it goes on from a released one."""

@@ -29,7 +29,7 @@ class BaseStage:
     name = "base"
     needs = ("practice",)
     shards = ("views", "lessons", "clips")
-    recipe = 11
+    recipe = 12
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """Of the tokenizer only the words: no stage before it, and no motion in its prompts."""

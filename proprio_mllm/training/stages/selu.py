@@ -1,12 +1,12 @@
 """Stage `selu` (paper, stage 3): the actor explores, the critic judges and relabels, both learn from what is kept.
 
 Actor and critic are two LoRA adapters over the stage-2 model: the actor goes on with stage 2's adapter, the critic starts as
-its copy. A round: roll the actor out with a temperature, judge every end, ask oneself and relabel failures keeping the verb,
-fine-tune the critic, judge again, fine-tune the actor on the kept trajectories; where the critic's yes is too often wrong about
-held-out lessons (`selu.precision`), nothing is kept and the critic learns from lessons alone. Before the first round the critic
-learns from questions about the expert's logs and about episodes in words. The critic's agreement with the simulator is reported
-and, unless `truth=oracle`, never used. Part of each batch is replayed against forgetting: demonstrations, and episodes in words
-in the proportion of stage 2; the abstract of SELU mentions no replay.
+its copy, which says already when it is done. A round: roll the actor out with a temperature, judge every end, ask oneself and
+relabel failures keeping the verb, fine-tune the critic, judge again, fine-tune the actor on the kept trajectories; where the
+critic's yes is too often wrong about held-out lessons (`selu.precision`), nothing is kept and the critic learns from lessons
+alone. The critic's agreement with the simulator is reported and, unless `truth=oracle`, never used. Part of each batch is
+replayed against forgetting: decisions of lessons, and for the critic questions about them; the abstract of SELU mentions no
+replay.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from proprio_mllm.model.groups import train_only
 from proprio_mllm.model.modeling import ProprioMLLM
 from proprio_mllm.model.motion_tokenizer import MotionTokenizer
 from proprio_mllm.training.critic import (
+    Judge,
     ModelJudge,
     OracleJudge,
     Trajectory,
@@ -41,7 +42,7 @@ from proprio_mllm.training.critic import (
     precision,
 )
 from proprio_mllm.training.goals import Relabel
-from proprio_mllm.training.judging import completion_examples, judge_example
+from proprio_mllm.training.judging import Verdicts, state_example
 from proprio_mllm.training.loop import Objective, Parts
 from proprio_mllm.training.paths import finish, finished_key
 from proprio_mllm.training.pipeline import Metrics, Pipeline
@@ -53,8 +54,8 @@ logger = logging.getLogger(__name__)
 
 #: Adapter names; the actor's is the one that stage 2 trained.
 ACTOR, CRITIC = "default", "critic"
-#: Held-out questions that tell the critic's precision, whether a goal was completed; half of them at the end of an episode.
-_ASKED: Final = 200
+#: Held-out questions that tell the critic's precision, whether a goal holds.
+_ASKED: Final = 400
 
 
 class ExampleObjective(Objective):
@@ -155,17 +156,24 @@ class _Learner:
         self.model.to(processes().device)
         self._demos = lessons_of(pipeline, self.model.cfg)
         self._turns = turns_of(pipeline, self.model, self._demos, self.tokenizer)
+        self._verdicts = Verdicts(self.model, self._demos, self._turns.codes)
 
     def judge(self) -> ModelJudge:
-        """The critic."""
+        """The critic as it is now."""
         return ModelJudge(self.model, CRITIC)
 
     def precision(self) -> float:
         """How often the critic is right when it says yes to held-out questions about lessons."""
-        return precision(self.judge(), completion_examples(self._demos, _ASKED, self._turns.codes))
+        return precision(self.judge(), self._verdicts.held_out(_ASKED))
 
     def _judging(self, rng: np.random.Generator) -> Example:
-        return judge_example(self._demos, int(self._demos.draw(rng, 1)[0]), rng, self._turns.codes)
+        """What the critic must not forget, when planners are done and the states of things, and goals that were not met."""
+        kind = rng.integers(3)
+        if kind == 0:
+            return self._planning(rng)
+        if kind == 1:
+            return self._verdicts.draw(rng)
+        return state_example(self._demos, int(self._demos.draw(rng, 1)[0]), rng, self._turns.codes)
 
     def _planning(self, rng: np.random.Generator) -> Example:
         return self._turns.draw(rng, 1)[0]
@@ -212,19 +220,19 @@ class _Selu:
         torch.cuda.empty_cache()  # of the last round's model: the actor runs in processes of its own
         first_alone(act)
         learner = _Learner(self.pipeline, before, self.key)
-        if number == 0:
-            learner.tune(CRITIC, "selu/practice", [], cfg.critic, 1.0, folder / "practice")
-        style = learner.model.cfg.prompt
         trajectories = _trajectories(read_rollouts(request.folder), learner.tokenizer)
         if not trajectories:
             raise ValueError(f"{request.folder}: the collector wrote no episode")
         goals: dict[tuple[str, str], Relabel] = {}
-        judge = OracleJudge(goals) if cfg.truth == "oracle" else learner.judge()
+        oracle = OracleJudge(goals) if cfg.truth == "oracle" else None
+        judge: Judge = oracle or learner.judge()
         metrics: dict[str, float] = {f"before_{name}": value for name, value in audit(trajectories, {}, judge).items()}
-        learnt = critic_examples(trajectories, judge, style, goals) if self._counts(learner, metrics, "before") else []
+        counts = self._counts(learner, metrics, "before")
+        learnt = critic_examples(learner.model, trajectories, judge, goals) if counts else []
         for kind in ("direct", "relabel", "negative"):
             metrics[f"critic_{kind}"] = float(sum(one.kind == kind for one in learnt))
         learner.tune(CRITIC, "selu/critic", [one.example for one in learnt], cfg.critic, cfg.replay_share, folder / "critic")
+        judge = oracle or learner.judge()
         kept = keep(trajectories, goals, judge, cfg.per_class) if self._counts(learner, metrics, "after") else []
         metrics |= {f"after_{name}": value for name, value in audit(trajectories, goals, judge).items()}
         steps = actor_examples(learner.model, kept)
@@ -261,7 +269,7 @@ class SeluStage:
     name = "selu"
     needs = ("alignment",)
     shards = ()
-    recipe = 6
+    recipe = 7
 
     def settings(self, pipeline: Pipeline) -> Mapping[str, Any]:
         """The rounds, whoever runs the episodes."""
