@@ -269,6 +269,28 @@ def test_a_critic_that_is_often_wrong_teaches_the_actor_nothing(
     assert bool(moved) is counts
 
 
+@pytest.mark.parametrize(("after", "stays"), [(0.95, True), (0.86, False)])
+def test_a_critic_that_learnt_to_be_wrong_is_put_back(
+    trained: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: float, stays: bool
+) -> None:
+    shutil.copytree(trained.cfg.output, tmp_path / "run")
+    found = iter((0.9, after))
+    monkeypatch.setattr(selu, "precision", lambda judge, asked: next(found))
+    monkeypatch.setattr(selu.ModelJudge, "completed", lambda self, asked: [at == t.rollout.length for t, at, _ in asked])
+    settings = dataclasses.replace(trained.cfg.selu, truth="audit", rounds=1)
+    cfg = dataclasses.replace(trained.cfg, output=str(tmp_path / "run"), selu=settings, overwrite=True)
+    told = Pipeline(STAGES, cfg, collect, "", correct, Lessons())
+    metrics = told.run("selu")
+    assert metrics is not None and metrics["round0_kept"] > 0  # by the critic that was right more often
+    began, ended = (dict(load_model(told.paths.model(stage)).named_parameters()) for stage in ("alignment", "selu"))
+    moved = [name for name in began if ".default" in name and not torch.equal(began[name], ended[_critics(name)])]
+    assert bool(moved) is stays
+
+
+def _critics(name: str) -> str:
+    return name.replace(".default", f".{CRITIC}")
+
+
 def test_another_critic_is_taught_from_the_same_rollouts(trained: Pipeline, tmp_path: Path) -> None:
     shutil.copytree(trained.cfg.output, tmp_path / "run")
     first, longer = trained.cfg.selu, dataclasses.replace(trained.cfg.selu.critic, steps=9)

@@ -2,11 +2,11 @@
 
 Actor and critic are two LoRA adapters over the stage-2 model: the actor goes on with stage 2's adapter, the critic starts as
 its copy, which says already when it is done. A round: roll the actor out with a temperature, judge every end, ask oneself and
-relabel failures keeping the verb, fine-tune the critic, judge again, fine-tune the actor on the kept trajectories; where the
-critic's yes is too often wrong about held-out lessons (`selu.precision`), nothing is kept and the critic learns from lessons
-alone. The critic's agreement with the simulator is reported and, unless `truth=oracle`, never used. Part of each batch is
-replayed against forgetting: decisions of lessons, and for the critic questions about them; the abstract of SELU mentions no
-replay.
+relabel failures keeping the verb, fine-tune the critic, judge again, fine-tune the actor on the kept trajectories. A critic
+whose yes about held-out lessons is less often right than before is put back; where it is too often wrong (`selu.precision`),
+nothing is kept and the critic learns from lessons alone. The critic's agreement with the simulator is reported and, unless
+`truth=oracle`, never used. Part of each batch is replayed against forgetting: decisions of lessons, for the critic questions
+about them too; the abstract of SELU mentions no replay.
 """
 
 from __future__ import annotations
@@ -121,11 +121,15 @@ def train_adapter(model: ProprioMLLM, name: str) -> list[nn.Parameter]:
     train_only(model, ("lora", "rows"))
     chosen = []
     for key, parameter in model.named_parameters():
-        mine = f".{name}." in key or key.endswith(f".{name}")
-        parameter.requires_grad_(parameter.requires_grad and mine)
+        parameter.requires_grad_(parameter.requires_grad and _of(name, key))
         if parameter.requires_grad:
             chosen.append(parameter)
     return chosen
+
+
+def _of(adapter: str, parameter: str) -> bool:
+    """Whether a parameter is an adapter's."""
+    return f".{adapter}." in parameter or parameter.endswith(f".{adapter}")
 
 
 def _trajectories(rollouts: Sequence[Rollout], tokenizer: MotionTokenizer | None) -> list[Trajectory]:
@@ -161,6 +165,15 @@ class _Learner:
     def judge(self) -> ModelJudge:
         """The critic as it is now."""
         return ModelJudge(self.model, CRITIC)
+
+    def critic(self) -> dict[str, Tensor]:
+        """What the critic has learnt so far: a copy of its adapter's weights."""
+        named = self.model.named_parameters()
+        return {name: tensor.detach().clone() for name, tensor in named if _of(CRITIC, name)}
+
+    def put_back(self, critic: Mapping[str, Tensor]) -> None:
+        """Makes the critic what it was."""
+        self.model.load_state_dict(critic, strict=False)
 
     def precision(self) -> float:
         """How often the critic is right when it says yes to held-out questions about lessons."""
@@ -227,13 +240,19 @@ class _Selu:
         oracle = OracleJudge(goals) if cfg.truth == "oracle" else None
         judge: Judge = oracle or learner.judge()
         metrics: dict[str, float] = {f"before_{name}": value for name, value in audit(trajectories, {}, judge).items()}
-        counts = self._counts(learner, metrics, "before")
-        learnt = critic_examples(learner.model, trajectories, judge, goals) if counts else []
+        before = self._precision(learner, metrics, "before")
+        learnt = critic_examples(learner.model, trajectories, judge, goals) if before >= cfg.precision else []
         for kind in ("direct", "relabel", "negative"):
             metrics[f"critic_{kind}"] = float(sum(one.kind == kind for one in learnt))
+        untaught = learner.critic()
         learner.tune(CRITIC, "selu/critic", [one.example for one in learnt], cfg.critic, cfg.replay_share, folder / "critic")
-        judge = oracle or learner.judge()
-        kept = keep(trajectories, goals, judge, cfg.per_class) if self._counts(learner, metrics, "after") else []
+        after = self._precision(learner, metrics, "after")
+        if after >= before:
+            judge = oracle or learner.judge()
+        else:
+            logger.warning("selu: the critic's yes is right in %.2f of cases, %.2f before it learnt: put back", after, before)
+            learner.put_back(untaught)
+        kept = keep(trajectories, goals, judge, cfg.per_class) if max(before, after) >= cfg.precision else []
         metrics |= {f"after_{name}": value for name, value in audit(trajectories, goals, judge).items()}
         steps = actor_examples(learner.model, kept)
         metrics |= {
@@ -249,10 +268,10 @@ class _Selu:
         first_alone(lambda: finish(folder, key, metrics))
         return metrics
 
-    def _counts(self, learner: _Learner, metrics: dict[str, float], when: str) -> bool:
-        """Whether the judge's yes counts: the simulator's always, the critic's from `selu.precision` on."""
+    def _precision(self, learner: _Learner, metrics: dict[str, float], when: str) -> float:
+        """How often the judge's yes is right: the simulator's always, the critic's to questions about held-out lessons."""
         if self.cfg.truth == "oracle":
-            return True
+            return 1.0
         metrics[f"{when}_held_out_precision"] = found = learner.precision()
         if found < self.cfg.precision:
             logger.warning(
@@ -260,7 +279,7 @@ class _Selu:
                 found,
                 self.cfg.precision,
             )
-        return found >= self.cfg.precision
+        return found
 
 
 class SeluStage:
