@@ -19,7 +19,7 @@ from tools.publish import FOLDER, results
 
 ROOT = Path(__file__).parents[2]
 RESULTS = results()
-BIT, SELU, BEFORE, BLIND = (results(name) for name in ("bit", "selu_oracle", "before", "blind"))
+BIT, SELU, ORACLE, BEFORE, BLIND = (results(name) for name in ("bit", "selu", "selu_oracle", "before", "blind"))
 #: By seed.
 ABLATIONS = [results(f"ablations/{seed}") for seed in range(3)]
 LONGER = results("ablations/240_steps")
@@ -195,7 +195,9 @@ def test_the_table_of_its_own_body() -> None:
 
 @pytest.mark.parametrize("robot", ["h1", "x1"])
 def test_the_table_of_learning_from_itself(robot: str) -> None:
-    runs = {"release before": BEFORE[f"proprio-{robot}-easy"], "after one round": SELU[f"proprio-{robot}-easy-essential"]}
+    whole, name = f"proprio-{robot}-easy", f"proprio-{robot}-easy-essential"
+    runs = {"release before": BEFORE[whole], "after one round": ORACLE[name]}
+    runs |= {"release": RESULTS[whole], "after 600 episodes": SELU[name]}
     for label, run in runs.items():
         assert f"| {label}, {robot.upper()} | {counts(run, 'essential')} |" in LEARNT.splitlines()
 
@@ -225,7 +227,7 @@ def test_what_seeing_and_feeling_bring(robot: str) -> None:
 
 
 def test_files_name_no_machine() -> None:
-    folders = {"": RESULTS, "bit/": BIT, "selu/": SELU, "before/": BEFORE, "blind/": BLIND}
+    folders = {"": RESULTS, "bit/": BIT, "selu/": SELU, "selu_oracle/": ORACLE, "before/": BEFORE, "blind/": BLIND}
     folders |= {f"ablations/{seed}/": one for seed, one in enumerate(ABLATIONS)} | {"ablations/240_steps/": LONGER}
     files = {f"{folder}{name}": one for folder, some in folders.items() for name, one in some.items()}
     for name, result in files.items():

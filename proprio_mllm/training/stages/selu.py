@@ -250,7 +250,7 @@ class _Selu:
         if after >= before:
             judge = oracle or learner.judge()
         else:
-            logger.warning("selu: the critic's yes is right in %.2f of cases, %.2f before it learnt: put back", after, before)
+            logger.warning("selu: the critic is less often right than before: put back")
             learner.put_back(untaught)
         kept = keep(trajectories, goals, judge, cfg.per_class) if max(before, after) >= cfg.precision else []
         metrics |= {f"after_{name}": value for name, value in audit(trajectories, goals, judge).items()}
@@ -273,12 +273,9 @@ class _Selu:
         if self.cfg.truth == "oracle":
             return 1.0
         metrics[f"{when}_held_out_precision"] = found = learner.precision()
+        logger.info("selu: %s it learns, %.2f of the critic's yes to held-out questions are right", when, found)
         if found < self.cfg.precision:
-            logger.warning(
-                "selu: the critic's yes to held-out questions is right in %.2f of cases, below selu.precision=%.2f: not used",
-                found,
-                self.cfg.precision,
-            )
+            logger.warning("selu: that is below selu.precision=%.2f and does not count", self.cfg.precision)
         return found
 
 
