@@ -38,6 +38,7 @@ from proprio_mllm.training.judging import Verdicts, state_example
 from proprio_mllm.training.pipeline import base_model_config
 from proprio_mllm.training.rollouts import Moment, Rollout
 from proprio_mllm.training.sources import Demos
+from proprio_mllm.training.states import history_of
 
 KNOWN = ("Mug_1", "Plate_1", "CoffeeTable_1")
 
@@ -261,18 +262,28 @@ def spoken(model: ProprioMLLM, goal: str) -> list[str]:
     return [word if word in known else "?" for word in text_words(goal)]
 
 
-def test_an_episode_is_asked_whether_it_met_the_goal_of_another(demos: Demos, reader: ProprioMLLM) -> None:
+def test_an_episode_is_asked_whether_it_met_the_goal_of_another(
+    demos: Demos, reader: ProprioMLLM, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown, asked = demos.shown, list[tuple[int, str]]()
+    monkeypatch.setattr(demos, "shown", lambda index, goal: asked.append((index, goal)) or shown(index, goal))
     rng, verdicts = np.random.default_rng(0), Verdicts(reader, demos, None)
     found = [verdicts.draw(rng) for _ in range(100)]
     answers = [answer[0] for answer in learnt_words(reader, found)]
     assert set(answers) == {"Done", "again"} and min(map(answers.count, answers)) > 10
-    instructions = [spoken(reader, text) for text in demos.reader.column("instruction")]
-    for example, answer in zip(found, answers, strict=True):
-        words = words_in(reader, example, False)
-        assert goal_in(reader, example) in instructions
-        assert words[-1] == "do"
-        if answer == "Done":
-            assert "Pick left" in " ".join(words[words.index("did") : words.index("now")])
+    for example, answer, (index, goal) in zip(found, answers, asked, strict=True):
+        assert goal_in(reader, example) == spoken(reader, goal)
+        assert (answer == "Done") is (goal == demos.reader[index]["instruction"])
+        assert demos.reader[index]["target"] == "Done()" and index in demos.split.train
+        assert words_in(reader, example, False)[-1] == "do"
+
+
+def test_what_was_shown_begins_with_the_episode(demos: Demos) -> None:
+    for index in range(demos.starts[3]):
+        shown = demos.shown(index, "Tidy up.")
+        assert {one.instruction for one in shown} == {"Tidy up."}
+        assert [list(one.history) for one in shown] == [history_of(demos.reader[index])[:at] for at in range(len(shown))]
+        assert len(shown[-1].history) == len(history_of(demos.reader[index]))
 
 
 def test_questions_about_states_are_answered_with_ids(demos: Demos) -> None:
