@@ -77,38 +77,32 @@ class Verdicts:
 
     def __init__(self, model: ProprioMLLM, demos: Demos, tokens: NDArray[np.int64] | None) -> None:
         self._model, self._demos, self._tokens = model, demos, tokens
-        test = np.isin(demos.ends, demos.split.test)
-        self._ends = {True: demos.ends[test], False: demos.ends[~test]}
 
     def draw(self, rng: np.random.Generator) -> Example:
         """Whether an episode that is learnt from has met another's goal, with the answer: what no planner has learnt to say."""
-        index = int(rng.choice(self._ends[False]))
-        return self._example(index, *self._other(index, rng))
+        ends = np.intersect1d(self._demos.ends, self._demos.split.train)
+        index = int(rng.choice(ends))
+        goal = self._goal(int(rng.choice(ends)))
+        return self._example(index, goal, goal == self._goal(index))
 
     def held_out(self, count: int) -> list[tuple[Example, bool]]:
         """Questions about rows that are held out, the same every time, and what is true; none when nothing is held out.
 
         Half of them are about the end of an episode, and some of these about another's goal.
         """
-        rng, rows, ends = np.random.default_rng(0), self._demos.split.test, self._ends[True]
-        before = np.setdiff1d(rows, ends)
+        rng, rows = np.random.default_rng(0), self._demos.split.test
+        ends, before = np.intersect1d(self._demos.ends, rows), np.setdiff1d(rows, self._demos.ends)
         found: list[tuple[Example, bool]] = []
         for _ in range(count if len(rows) else 0):
             ended = len(ends) > 0 and rng.random() < _ENDED
             index = int(rng.choice(ends if ended else before))
-            asked = self._goal(index), bool(ended)
-            if ended and rng.random() < _OTHER:
-                asked = self._other(index, rng)
-            found.append((self._example(index, asked[0], None), asked[1]))
+            other = ended and rng.random() < _OTHER
+            goal = self._goal(int(rng.choice(ends)) if other else index)
+            found.append((self._example(index, goal, None), bool(ended) and goal == self._goal(index)))
         return found
 
     def _goal(self, index: int) -> str:
         return str(self._demos.reader[index]["instruction"])
-
-    def _other(self, index: int, rng: np.random.Generator) -> tuple[str, bool]:
-        """The goal of an episode of the same part, and whether it is this one's too."""
-        goal = self._goal(int(rng.choice(self._ends[bool(np.isin(index, self._ends[True]))])))
-        return goal, goal == self._goal(index)
 
     def _example(self, index: int, goal: str, done: bool | None) -> Example:
         codes = None if self._tokens is None else self._tokens[index].tolist()

@@ -219,7 +219,10 @@ class Demos:
         """What a planner with a goal would have seen of a row's episode, up to that row."""
         start = self.starts[int(np.searchsorted(self.starts, index, side="right")) - 1]
         rows = [self.reader[row] for row in range(start, index + 1)]
-        return [Shown(goal, row["robot"], tuple(row["visible"]), tuple(row["known"]), tuple(history_of(row))) for row in rows]
+        history = tuple(history_of(rows[-1]))
+        return [
+            Shown(goal, row["robot"], tuple(row["visible"]), tuple(row["known"]), history[:at]) for at, row in enumerate(rows)
+        ]
 
     def view(self, row: Mapping[str, Any]) -> View:
         """The head-camera view of a row."""
