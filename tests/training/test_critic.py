@@ -292,10 +292,33 @@ def test_questions_about_states_are_answered_with_ids(demos: Demos) -> None:
     assert "none" in found and any(reply.endswith("_1") for reply in found)
 
 
-def test_held_out_questions_are_of_episodes_that_no_training_sees(demos: Demos, reader: ProprioMLLM) -> None:
+def holds(demos: Demos, index: int, goal: str) -> bool:
+    """Whether a goal is met before a row."""
+    return demos.reader[index]["target"] == "Done()" and goal == demos.reader[index]["instruction"]
+
+
+def test_a_held_out_question_about_the_goal_of_another_is_answered_no(
+    demos: Demos, reader: ProprioMLLM, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(demos.split, "test", np.arange(len(demos.motions)))  # so that there are several goals
+    shown, told = demos.shown, list[tuple[int, str]]()
+    monkeypatch.setattr(demos, "shown", lambda index, goal: told.append((index, goal)) or shown(index, goal))
+    truths = [truth for _, truth in Verdicts(reader, demos, None).held_out(60)]
+    assert truths == [holds(demos, index, goal) for index, goal in told]
+    assert any(goal != demos.reader[index]["instruction"] for index, goal in told)
+
+
+def test_held_out_questions_are_of_episodes_that_no_training_sees(
+    demos: Demos, reader: ProprioMLLM, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown, told = demos.shown, list[tuple[int, str]]()
+    monkeypatch.setattr(demos, "shown", lambda index, goal: told.append((index, goal)) or shown(index, goal))
     asked, again = (Verdicts(reader, demos, None).held_out(60) for _ in range(2))
     assert [(one.tokens, truth) for one, truth in asked] == [(one.tokens, truth) for one, truth in again]
     assert {truth for _, truth in asked} == {True, False}
+    for (_, truth), (index, goal) in zip(asked, told[:60], strict=True):
+        assert index in demos.split.test
+        assert truth is holds(demos, index, goal)
     assert not any(learnt_words(reader, [one for one, _ in asked]))  # the answer is not shown
     rows = [demos.reader[int(index)] for index in demos.split.test]
     goals = [spoken(reader, row["instruction"]) for row in rows]
